@@ -1,0 +1,164 @@
+"""Every setting in one place: frozen dataclasses from which ROS parameters, YAML files and command lines are made.
+
+A field carries its one default, and in its metadata the sentence that describes it and the range that it may lie in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+from crossloc3d_ros.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def option(default: T, text: str, *, low: float | None = None, high: float | None = None) -> T:
+    """Declare a dataclass field with a description and, for numbers, an inclusive range."""
+    return typing.cast(T, field(default=default, metadata={"text": text, "low": low, "high": high}))
+
+
+@dataclass(frozen=True)
+class PreprocessingConfig:
+    """How metres become a patch; travels with the weights, because they were trained on it."""
+
+    half_extent_m: float = option(
+        50.0, "half the side of an aerial submap, and the unit of its patch", low=1.0, high=1000.0
+    )
+    scan_half_extent_m: float = option(50.0, "the same for a scan", low=1.0, high=1000.0)
+    n_points: int = option(4096, "points of a patch", low=16, high=1_000_000)
+    ground_clearance_m: float = option(0.5, "what lies lower above the ground is left out", low=0.0, high=10.0)
+    thin_m: float = option(0.5, "one point a cube of this side before the random choice; 0 = all", low=0.0, high=10.0)
+    min_points: int = option(256, "with fewer points above the ground there is no patch", low=1, high=1_000_000)
+    scan_origin: Literal["sensor", "mean"] = option("sensor", "what a scan's patch is centred on")
+    submap_origin: Literal["grid", "bounding_box"] = option("grid", "what a submap's patch is centred on")
+    vertical_origin: Literal["ground", "centre"] = option(
+        "ground", "z above the local ground, or from the same centre as x and y"
+    )
+    seed: int = option(0, "seed of the random choice of points", low=0, high=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Everything that the paper varies."""
+
+    voxel_sizes: tuple[float, ...] = option((0.05, 0.12, 0.4), "grains, fine to coarse, in patch units; 1 to 4")
+    kept_branches: int = option(
+        3, "receptive fields kept of the five; 0 = selection off (all are averaged)", low=0, high=5
+    )
+    refinement: Literal["coarse_to_fine", "fine_to_coarse", "none"] = option(
+        "coarse_to_fine", "order of the grains; none = concatenation"
+    )
+    sub_steps: int = option(3, "refinement layers a grain", low=1, high=8)
+    memory_sizes: tuple[int, ...] = option((256, 128, 128, 128, 64, 64, 32, 32, 32), "centres of each refinement layer")
+    time_embedding: bool = option(True, "whether the layers are told their number")
+    channels: int = option(64, "width of the backbone", low=8, high=512)
+    heads: int = option(4, "attention heads", low=1, high=16)
+    fused_channels: int = option(512, "width before the pooling", low=8, high=4096)
+    clusters: int = option(64, "NetVLAD clusters", low=1, high=1024)
+    descriptor_size: int = option(256, "numbers in a descriptor", low=2, high=4096)
+
+
+@dataclass(frozen=True)
+class MountingConfig:
+    """Pose of the lidar on the robot, `T_base_lidar`; `base` stands on the ground."""
+
+    x_m: float = option(0.0, "forward of base", low=-20.0, high=20.0)
+    y_m: float = option(0.0, "left of base", low=-20.0, high=20.0)
+    z_m: float = option(1.2, "above the ground under the robot", low=-5.0, high=20.0)
+    roll_deg: float = option(0.0, "about x", low=-180.0, high=180.0)
+    pitch_deg: float = option(0.0, "about y, positive nose down (REP-103)", low=-180.0, high=180.0)
+    yaw_deg: float = option(0.0, "about z, counter-clockwise", low=-180.0, high=180.0)
+
+
+@dataclass(frozen=True)
+class ScanConfig:
+    """Which points of a scan are used."""
+
+    min_range_m: float = option(1.0, "nearer points are left out", low=0.0, high=100.0)
+    max_range_m: float = option(100.0, "farther points are left out", low=1.0, high=1000.0)
+    body_min_m: tuple[float, float, float] = option(
+        (-0.6, -0.5, -0.5), "lower corner of the robot's own body, base frame"
+    )
+    body_max_m: tuple[float, float, float] = option(
+        (0.6, 0.5, 2.0), "upper corner of the same; equal corners = no body"
+    )
+    mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
+
+
+@dataclass(frozen=True)
+class LocalizerConfig:
+    """From a scan to an estimate."""
+
+    top_k: int = option(25, "candidates to retrieve", low=1, high=1000)
+    scan: ScanConfig = field(default_factory=ScanConfig, metadata={"text": "use of the scan"})
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """From an aerial survey to a map."""
+
+    spacing_m: float = option(19.0, "distance between the centres of neighbouring submaps", low=1.0, high=1000.0)
+    cell_m: float = option(1.0, "cell of terrain and surface rasters", low=0.1, high=10.0)
+    tile_m: float = option(380.0, "side of the tiles in which the area is worked through", low=50.0, high=5000.0)
+    chunk_points: int = option(1_000_000, "points read from a file at once", low=1000, high=100_000_000)
+    workers: int = option(1, "processes on this machine", low=1, high=256)
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Return the configuration as plain nested dicts, ready for JSON or YAML."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(kind: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
+    """Build a configuration from nested mappings; unknown keys, wrong types and out-of-range values raise ConfigError.
+
+    Missing keys keep their defaults. `where` prefixes the names in messages.
+    """
+    hints = typing.get_type_hints(kind)
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{where}{key}"
+        if key not in fields:
+            raise ConfigError(f"unknown setting '{name}'; known are: {', '.join(sorted(fields))}")
+        arguments[key] = check_value(name, hints[key], value, fields[key].metadata)
+    return kind(**arguments)
+
+
+def check_value(name: str, hint: Any, value: Any, metadata: Mapping[str, Any]) -> Any:
+    """Return `value` converted to the field's type, or raise ConfigError naming the setting."""
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"'{name}' must be a group of settings, got {value!r}")
+        return from_dict(typing.cast(type[Any], hint), value, where=f"{name}.")
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in typing.get_args(hint):
+            return None
+        hint = next(a for a in typing.get_args(hint) if a is not type(None))
+        origin = typing.get_origin(hint)
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            raise ConfigError(f"'{name}' must be one of {', '.join(map(str, typing.get_args(hint)))}, got {value!r}")
+        return value
+    if origin is tuple:
+        inner = typing.get_args(hint)
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"'{name}' must be a list, got {value!r}")
+        if inner[-1] is not Ellipsis and len(value) != len(inner):
+            raise ConfigError(f"'{name}' must hold {len(inner)} values, got {len(value)}")
+        return tuple(check_value(f"{name}[{i}]", inner[0], v, metadata) for i, v in enumerate(value))
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
+        raise ConfigError(f"'{name}' must be of type {hint.__name__}, got {value!r}")
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        low, high = metadata.get("low"), metadata.get("high")
+        if not ((low is None or value >= low) and (high is None or value <= high)):
+            raise ConfigError(f"'{name}' must lie between {low} and {high}, got {value}")
+    return value

@@ -1,0 +1,1 @@
+"""Patch in, descriptor out: the CrossLoc3D network, its weights and its fast CPU runtime."""

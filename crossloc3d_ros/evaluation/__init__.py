@@ -1,0 +1,1 @@
+"""Replay of bags, recall, and the page that shows both."""

@@ -1,0 +1,1 @@
+"""Places to learn from, the loss and the loop."""

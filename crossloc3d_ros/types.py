@@ -1,0 +1,124 @@
+"""The nouns that pass between the packages: frozen, named, with shape, unit and frame beside each field.
+
+Frames. `lidar`: as the sensor gives it (x forward, y left, z up). `base`: the robot's `base_link`
+(REP-103). `grid`: the map's projected CRS, easting/northing/height in metres, float64. `map`: the ENU
+tangent frame at the map's origin (REP-105). Time is integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+BoolArray = npt.NDArray[np.bool_]
+Float32Array = npt.NDArray[np.float32]
+Float64Array = npt.NDArray[np.float64]
+Int32Array = npt.NDArray[np.int32]
+Int64Array = npt.NDArray[np.int64]
+UInt8Array = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One revolution of the LiDAR."""
+
+    points: Float32Array
+    """(N, 3), metres, lidar frame; may hold NaN and infinities as drivers send them."""
+    stamp_ns: int
+    frame_id: str
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """What the encoder sees: a fixed number of above-ground points around a place."""
+
+    points: Float32Array
+    """(n_points, 3) in [-1, 1]: x and y from the centre, z the height above the ground, all over `half_extent_m`."""
+    half_extent_m: float
+    source_count: int
+    """How many points there were to choose from."""
+
+
+@dataclass(frozen=True, eq=False)
+class AerialChunk:
+    """Some points of an aerial survey, in the order of the file."""
+
+    points: Float64Array
+    """(N, 3) easting, northing, height, metres; the CRS is said by whoever hands the chunk over."""
+    classification: UInt8Array
+    """(N,) ASPRS classes; 2 ground, 6 building, 7 and 18 noise, 9 water."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The k submaps whose descriptors lie nearest, best first."""
+
+    submap_ids: Int64Array
+    """(k,) rows of the map's submap table."""
+    descriptor_distances: Float32Array
+    """(k,) Euclidean, in descriptor units."""
+    probabilities: Float64Array
+    """(k,) share of belief that each candidate is the place; at most 1 in all."""
+    grid: Float64Array
+    """(k, 3) easting, northing, ground height, metres, grid frame."""
+
+    def __len__(self) -> int:
+        return len(self.submap_ids)
+
+
+class FixStatus(Enum):
+    """Whether an estimate may be driven by."""
+
+    NO_FIX = "no fix"
+    FIX = "fix"
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Milliseconds that each step of one localisation took."""
+
+    prepare_ms: float = 0.0
+    encode_ms: float = 0.0
+    search_ms: float = 0.0
+
+    @property
+    def total_ms(self) -> float:
+        return self.prepare_ms + self.encode_ms + self.search_ms
+
+
+@dataclass(frozen=True)
+class ScanCounts:
+    """How many points each step of the scan's preparation left."""
+
+    received: int = 0
+    finite: int = 0
+    in_range: int = 0
+    off_body: int = 0
+    above_ground: int = 0
+    in_patch: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the scan was taken, as far as it can be told."""
+
+    stamp_ns: int
+    status: FixStatus
+    reason: str
+    """One sentence for people: why there is or is no fix."""
+    grid: Float64Array
+    """(3,) easting, northing, height, metres, grid frame; NaN where there is no candidate at all."""
+    enu: Float64Array
+    """(3,) metres, map frame; NaN as above."""
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    """WGS84 ellipsoidal height; NaN where the geoid is not known."""
+    covariance: Float64Array
+    """(3, 3) ENU, square metres."""
+    candidates: Candidates
+    counts: ScanCounts = field(default_factory=ScanCounts)
+    timings: Timings = field(default_factory=Timings)
