@@ -19,16 +19,14 @@ T = TypeVar("T")
 
 def option(default: T, text: str, *, low: float | None = None, high: float | None = None) -> T:
     """Declare a dataclass field with a description and, for numbers, an inclusive range."""
-    return typing.cast(T, field(default=default, metadata={"text": text, "low": low, "high": high}))
+    return field(default=default, metadata={"text": text, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
 class PreprocessingConfig:
     """How metres become a patch; travels with the weights, because they were trained on it."""
 
-    half_extent_m: float = option(
-        50.0, "half the side of an aerial submap, and the unit of its patch", low=1.0, high=1000.0
-    )
+    half_extent_m: float = option(50.0, "half the side of a submap and the unit of its patch", low=1.0, high=1000.0)
     scan_half_extent_m: float = option(50.0, "the same for a scan", low=1.0, high=1000.0)
     n_points: int = option(4096, "points of a patch", low=16, high=1_000_000)
     ground_clearance_m: float = option(0.5, "what lies lower above the ground is left out", low=0.0, high=10.0)
@@ -36,9 +34,7 @@ class PreprocessingConfig:
     min_points: int = option(256, "with fewer points above the ground there is no patch", low=1, high=1_000_000)
     scan_origin: Literal["sensor", "mean"] = option("sensor", "what a scan's patch is centred on")
     submap_origin: Literal["grid", "bounding_box"] = option("grid", "what a submap's patch is centred on")
-    vertical_origin: Literal["ground", "centre"] = option(
-        "ground", "z above the local ground, or from the same centre as x and y"
-    )
+    vertical_origin: Literal["ground", "centre"] = option("ground", "z above the ground or from the centre")
     seed: int = option(0, "seed of the random choice of points", low=0, high=2**31 - 1)
 
 
@@ -47,12 +43,8 @@ class ModelConfig:
     """Everything that the paper varies."""
 
     voxel_sizes: tuple[float, ...] = option((0.05, 0.12, 0.4), "grains, fine to coarse, in patch units; 1 to 4")
-    kept_branches: int = option(
-        3, "receptive fields kept of the five; 0 = selection off (all are averaged)", low=0, high=5
-    )
-    refinement: Literal["coarse_to_fine", "fine_to_coarse", "none"] = option(
-        "coarse_to_fine", "order of the grains; none = concatenation"
-    )
+    kept_branches: int = option(3, "receptive fields kept of the five; 0 = no selection", low=0, high=5)
+    refinement: Literal["coarse_to_fine", "fine_to_coarse", "none"] = option("coarse_to_fine", "none = concatenation")
     sub_steps: int = option(3, "refinement layers a grain", low=1, high=8)
     memory_sizes: tuple[int, ...] = option((256, 128, 128, 128, 64, 64, 32, 32, 32), "centres of each refinement layer")
     time_embedding: bool = option(True, "whether the layers are told their number")
@@ -81,12 +73,8 @@ class ScanConfig:
 
     min_range_m: float = option(1.0, "nearer points are left out", low=0.0, high=100.0)
     max_range_m: float = option(100.0, "farther points are left out", low=1.0, high=1000.0)
-    body_min_m: tuple[float, float, float] = option(
-        (-0.6, -0.5, -0.5), "lower corner of the robot's own body, base frame"
-    )
-    body_max_m: tuple[float, float, float] = option(
-        (0.6, 0.5, 2.0), "upper corner of the same; equal corners = no body"
-    )
+    body_min_m: tuple[float, float, float] = option((-0.6, -0.5, -0.5), "lower corner of the own body, base frame")
+    body_max_m: tuple[float, float, float] = option((0.6, 0.5, 2.0), "upper corner; equal = no body")
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
 
 

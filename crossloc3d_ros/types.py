@@ -7,11 +7,16 @@ tangent frame at the map's origin (REP-105). Time is integer nanoseconds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from crossloc3d_ros.config import PreprocessingConfig
 
 BoolArray = npt.NDArray[np.bool_]
 Float32Array = npt.NDArray[np.float32]
@@ -122,3 +127,28 @@ class Estimate:
     candidates: Candidates
     counts: ScanCounts = field(default_factory=ScanCounts)
     timings: Timings = field(default_factory=Timings)
+
+
+class DescriptorEncoder(Protocol):
+    """What turns patches into descriptors; `encoder.runtime.Encoder` is the one that ships."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Identify weights, model and preprocessing: a map answers only to the encoder that made it."""
+
+    @property
+    def descriptor_size(self) -> int:
+        """Numbers in a descriptor."""
+
+    @property
+    def preprocessing(self) -> PreprocessingConfig:
+        """Return the preprocessing that the weights were trained on."""
+
+    def encode(self, points: Float32Array) -> Float32Array:
+        """Return the descriptor (D,) of a patch's points (n, 3) in [-1, 1]."""
+
+    def encode_batch(self, clouds: Sequence[Float32Array]) -> Float32Array:
+        """Return the descriptors (B, D) of B patches; each depends on its own points alone."""
+
+    def warm_up(self) -> None:
+        """Compile and touch whatever makes the first call slow."""
