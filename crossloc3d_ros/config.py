@@ -97,6 +97,47 @@ class BuildConfig:
     workers: int = option(1, "processes on this machine", low=1, high=256)
 
 
+@dataclass(frozen=True)
+class PlacesConfig:
+    """Simulated towns to learn from."""
+
+    families: tuple[str, ...] = option((), "kinds of towns, taken in turns; empty = all that the simulator knows")
+    town_size_m: float = option(400.0, "side of a town", low=200.0, high=2000.0)
+    scans: int = option(240, "scans of each town", low=1, high=100_000)
+    spacing_m: float = option(19.0, "distance between the centres of validation submaps", low=1.0, high=1000.0)
+    cell_m: float = option(1.0, "cell of the terrain raster", low=0.1, high=10.0)
+    sensor_height_m: tuple[float, float] = option((0.9, 1.6), "lowest and highest lidar above the ground", low=0.2)
+    tilt_deg: float = option(1.5, "standard deviation of the robot's roll and pitch", low=0.0, high=15.0)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How weights are learned."""
+
+    pairs: int = option(32, "pairs of a scan and a submap in a batch", low=2, high=4096)
+    towns_a_batch: int = option(4, "towns that a batch is drawn from: fewer = harder negatives", low=1, high=1024)
+    loss: Literal["info_nce", "batch_hard"] = option("info_nce", "whole-batch loss, or the paper's triplets")
+    margin: float = option(0.2, "of the triplets, descriptor units", low=0.0, high=100.0)
+    learning_rate: float = option(1e-3, "highest learning rate of AdamW", low=1e-7, high=1.0)
+    final_share: float = option(0.01, "learning rate at the end, as a share of the highest", low=0.0, high=1.0)
+    warm_up: float = option(0.04, "share of the budget in which the learning rate rises", low=0.0, high=1.0)
+    weight_decay: float = option(1e-3, "of AdamW", low=0.0, high=1.0)
+    clip_norm: float = option(5.0, "longest gradient", low=0.0, high=1e6)
+    ema_decay: float = option(0.99, "of the averaged weights, once warm", low=0.0, high=1.0)
+    offset_m: float = option(9.5, "a submap's centre lies at most so far from its scan, each way", low=0.0, high=100.0)
+    neighbour_m: float = option(50.0, "nearer places of one town are neither match nor mismatch", low=0.0, high=1e4)
+    keep_points: float = option(0.8, "least share of a scan's points that augmentation keeps", low=0.1, high=1.0)
+    sector_share: float = option(0.3, "share of scans with a blocked sector of up to 90 degrees", low=0.0, high=1.0)
+    seed: int = option(1, "of weights, batches and augmentation", low=0, high=2**31 - 1)
+    threads: int = option(1, "of torch", low=1, high=256)
+    device: Literal["cpu", "cuda"] = option("cpu", "where to train")
+    save_minutes: float = option(4.0, "between saved states", low=0.01, high=1e4)
+    validation_minutes: float = option(9.0, "between validations", low=0.01, high=1e4)
+    log_steps: int = option(10, "batches between two lines of the log", low=1, high=100_000)
+    model: ModelConfig = field(default_factory=ModelConfig, metadata={"text": "the network"})
+    preprocessing: PreprocessingConfig = field(default_factory=PreprocessingConfig, metadata={"text": "the patch"})
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Return the configuration as plain nested dicts, ready for JSON or YAML."""
     return dataclasses.asdict(config)
