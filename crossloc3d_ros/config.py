@@ -79,11 +79,49 @@ class ScanConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """What distances between descriptors mean; fitted on known places and stored with the weights."""
+
+    temperature: float = option(0.1, "distance by which a candidate's odds fall to 1/e", low=1e-6, high=1e6)
+    none_distance: float = option(1.0, "best distance at which 'no such place' is as likely as not", low=1e-6, high=1e6)
+    none_scale: float = option(0.1, "distance over which that belief turns", low=1e-6, high=1e6)
+
+
+@dataclass(frozen=True)
+class CredibilityConfig:
+    """From the candidates' distances and spread to probabilities, a covariance and the decision to give a fix."""
+
+    temperature: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
+    none_distance: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
+    none_scale: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
+    cluster_radius_m: float = option(50.0, "candidates this near to each other speak for one place", low=1.0, high=1000.0)
+    min_probability: float = option(0.5, "a fix needs this belief in one place", low=0.0, high=1.0)
+    position_floor_m: float = option(25.0, "least standard deviation east and north", low=0.1, high=1000.0)
+    height_floor_m: float = option(3.0, "least standard deviation of the height", low=0.1, high=1000.0)
+
+
+@dataclass(frozen=True)
 class LocalizerConfig:
     """From a scan to an estimate."""
 
     top_k: int = option(25, "candidates to retrieve", low=1, high=1000)
     scan: ScanConfig = field(default_factory=ScanConfig, metadata={"text": "use of the scan"})
+    credibility: CredibilityConfig = field(default_factory=CredibilityConfig, metadata={"text": "what is believed"})
+
+
+@dataclass(frozen=True)
+class LocalizerNodeConfig(LocalizerConfig):
+    """The localizer node's parameters: the localizer's own and what only a node needs."""
+
+    map: str = option("", "folder of the aerial map, as build_map writes it")
+    weights: str = option("", "weights file (safetensors); empty = the shipped weights")
+    device: str = option("cpu", "where the encoder runs: cpu or cuda")
+    autostart: bool = option(True, "configure and activate without being told by a lifecycle manager")
+    global_frame_id: str = option("map", "name of the ENU frame at the map's origin")
+    base_frame_id: str = option("base_link", "name of the frame whose position is given")
+    mounting_from_tf: bool = option(False, "take the lidar's pose on base_frame_id from TF, not from scan.mounting")
+    use_imu: bool = option(False, "level the scan by the accelerations on topic imu (axes of base_frame_id)")
+    imu_time_constant_s: float = option(1.0, "time constant of the low-pass on the accelerations", low=0.01, high=60.0)
 
 
 @dataclass(frozen=True)

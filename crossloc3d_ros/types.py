@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from crossloc3d_ros.config import PreprocessingConfig
+    from crossloc3d_ros.config import CalibrationConfig, PreprocessingConfig
 
 BoolArray = npt.NDArray[np.bool_]
 Float32Array = npt.NDArray[np.float32]
@@ -152,3 +152,12 @@ class DescriptorEncoder(Protocol):
 
     def warm_up(self) -> None:
         """Compile and touch whatever makes the first call slow."""
+
+
+@runtime_checkable
+class CalibratedEncoder(Protocol):
+    """An encoder whose weights carry what distances between its descriptors mean."""
+
+    @property
+    def calibration(self) -> CalibrationConfig | None:
+        """Return the calibration stored with the weights; None where there is none."""
