@@ -27,3 +27,7 @@ class CheckpointError(CrossLocError):
 
 class BagError(CrossLocError):
     """A bag is unreadable or lacks a topic."""
+
+
+class TrainingError(CrossLocError):
+    """A set of training places or a training run is missing, damaged or does not fit the other."""
