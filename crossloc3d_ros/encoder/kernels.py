@@ -1,0 +1,296 @@
+"""The CPU kernels of the sparse network, compiled by Numba: kernel maps and the gathered matrix product.
+
+Everything here works on plain NumPy arrays, releases the GIL and starts no threads of its own: whoever calls may run
+one kernel on several row ranges at once from several threads.
+
+The gathered matrix product `out[o] += x[i] @ w` is where the encoder spends its time. LLVM does not find the register
+tile by itself, so `_tile` spells it out: R rows of the input against 16 columns of the weights, accumulated in vector
+registers over all input channels, then added to R output rows. Nothing is gathered into a buffer, and absent
+neighbours cost nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+COLUMNS = 16
+"""Columns of a weight panel: two AVX2 registers, one AVX-512, four NEON."""
+
+MAX_DENSE_CELLS = 1 << 24
+"""Largest bounding box (in cells) that is looked up in a dense table; beyond it sorted keys are searched."""
+
+
+def _make_tile(n_rows: int) -> Any:
+    """Emit the register tile for `n_rows` input rows against one panel of 16 weight columns."""
+
+    @intrinsic
+    def tile(typingctx: Any, x: Any, w: Any, out: Any, w_at: Any, depth: Any, x_at: Any, out_at: Any) -> Any:
+        signature = types.void(x, w, out, types.intp, types.intp, types.UniTuple(types.intp, n_rows), types.UniTuple(types.intp, n_rows))
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            single = ir.FloatType()
+            vector = ir.VectorType(single, COLUMNS)
+            word = ir.IntType(64)
+
+            def data(position: int) -> Any:
+                return context.make_array(sig.args[position])(context, builder, args[position]).data
+
+            def load_vector(pointer: Any) -> Any:
+                return builder.load(builder.bitcast(pointer, vector.as_pointer()), align=4)
+
+            fma = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{COLUMNS}f32"
+            )
+            rows = [builder.gep(data(0), [builder.extract_value(args[5], r)]) for r in range(n_rows)]
+            panel = builder.gep(data(1), [args[3]])
+            sums = [cgutils.alloca_once(builder, vector) for _ in range(n_rows)]
+            zero = ir.Constant(vector, [0.0] * COLUMNS)
+            for total in sums:
+                builder.store(zero, total)
+            undefined = ir.Constant(vector, ir.Undefined)
+            lanes = ir.Constant(ir.VectorType(ir.IntType(32), COLUMNS), [0] * COLUMNS)
+            with cgutils.for_range(builder, args[4], intp=word) as loop:
+                weights = load_vector(builder.gep(panel, [builder.mul(loop.index, word(COLUMNS))]))
+                for row, total in zip(rows, sums, strict=True):
+                    value = builder.load(builder.gep(row, [loop.index]))
+                    first = builder.insert_element(undefined, value, ir.IntType(32)(0))
+                    broadcast = builder.shuffle_vector(first, undefined, lanes)
+                    builder.store(builder.call(fma, [broadcast, weights, builder.load(total)]), total)
+            for r, total in enumerate(sums):
+                target = builder.bitcast(builder.gep(data(2), [builder.extract_value(args[6], r)]), vector.as_pointer())
+                builder.store(builder.fadd(builder.load(target, align=4), builder.load(total)), target, align=4)
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return tile
+
+
+_tile6, _tile4, _tile2, _tile1 = (_make_tile(n) for n in (6, 4, 2, 1))
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def pack_weights(weights: Any) -> Any:
+    """Rearrange weights (K, Cin, Cout) into panels (K, Cout / 16, Cin, 16), zero-padded to whole panels."""
+    kernels, depth, width = weights.shape
+    panels = (width + COLUMNS - 1) // COLUMNS
+    packed = np.zeros((kernels, panels, depth, COLUMNS), np.float32)
+    for k in range(kernels):
+        for c in range(depth):
+            for o in range(width):
+                packed[k, o // COLUMNS, c, o % COLUMNS] = weights[k, c, o]
+    return packed
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any, last: Any, out: Any) -> None:
+    """Add `x[i] @ weights[k]` to `out[o]` for the pairs (i, o) = (in_rows, out_rows)[first[k]:last[k]] of each kernel k.
+
+    x (N, Cin) and out (M, Cout) float32, C-contiguous; packed from `pack_weights`; Cout a multiple of 16.
+    Within one kernel an output row must not occur twice.
+    """
+    kernels, panels, depth, _ = packed.shape
+    x_flat, w_flat, out_flat = x.ravel(), packed.ravel(), out.ravel()
+    x_step, out_step = x.shape[1], out.shape[1]
+    for k in range(kernels):
+        for panel in range(panels):
+            w_at = (k * panels + panel) * depth * COLUMNS
+            shift = panel * COLUMNS
+            p = first[k]
+            end = last[k]
+            while p + 6 <= end:
+                _tile6(
+                    x_flat,
+                    w_flat,
+                    out_flat,
+                    w_at,
+                    depth,
+                    (
+                        np.intp(in_rows[p]) * x_step,
+                        np.intp(in_rows[p + 1]) * x_step,
+                        np.intp(in_rows[p + 2]) * x_step,
+                        np.intp(in_rows[p + 3]) * x_step,
+                        np.intp(in_rows[p + 4]) * x_step,
+                        np.intp(in_rows[p + 5]) * x_step,
+                    ),
+                    (
+                        np.intp(out_rows[p]) * out_step + shift,
+                        np.intp(out_rows[p + 1]) * out_step + shift,
+                        np.intp(out_rows[p + 2]) * out_step + shift,
+                        np.intp(out_rows[p + 3]) * out_step + shift,
+                        np.intp(out_rows[p + 4]) * out_step + shift,
+                        np.intp(out_rows[p + 5]) * out_step + shift,
+                    ),
+                )
+                p += 6
+            if p + 4 <= end:
+                _tile4(
+                    x_flat,
+                    w_flat,
+                    out_flat,
+                    w_at,
+                    depth,
+                    (
+                        np.intp(in_rows[p]) * x_step,
+                        np.intp(in_rows[p + 1]) * x_step,
+                        np.intp(in_rows[p + 2]) * x_step,
+                        np.intp(in_rows[p + 3]) * x_step,
+                    ),
+                    (
+                        np.intp(out_rows[p]) * out_step + shift,
+                        np.intp(out_rows[p + 1]) * out_step + shift,
+                        np.intp(out_rows[p + 2]) * out_step + shift,
+                        np.intp(out_rows[p + 3]) * out_step + shift,
+                    ),
+                )
+                p += 4
+            if p + 2 <= end:
+                _tile2(
+                    x_flat,
+                    w_flat,
+                    out_flat,
+                    w_at,
+                    depth,
+                    (np.intp(in_rows[p]) * x_step, np.intp(in_rows[p + 1]) * x_step),
+                    (np.intp(out_rows[p]) * out_step + shift, np.intp(out_rows[p + 1]) * out_step + shift),
+                )
+                p += 2
+            if p < end:
+                _tile1(
+                    x_flat,
+                    w_flat,
+                    out_flat,
+                    w_at,
+                    depth,
+                    (np.intp(in_rows[p]) * x_step,),
+                    (np.intp(out_rows[p]) * out_step + shift,),
+                )
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def dense_product(x: Any, packed: Any, begin: int, end: int, out: Any) -> None:
+    """Add `x[begin:end] @ weights` to `out[begin:end]`; the one kernel of `packed`, Cout a multiple of 16."""
+    _, panels, depth, _ = packed.shape
+    x_flat, w_flat, out_flat = x.ravel(), packed.ravel(), out.ravel()
+    xs, os = x.shape[1], out.shape[1]
+    for panel in range(panels):
+        w_at = panel * depth * COLUMNS
+        shift = panel * COLUMNS
+        i = begin
+        while i + 6 <= end:
+            a, o = i * xs, i * os + shift
+            _tile6(
+                x_flat,
+                w_flat,
+                out_flat,
+                w_at,
+                depth,
+                (a, a + xs, a + 2 * xs, a + 3 * xs, a + 4 * xs, a + 5 * xs),
+                (o, o + os, o + 2 * os, o + 3 * os, o + 4 * os, o + 5 * os),
+            )
+            i += 6
+        while i < end:
+            _tile1(x_flat, w_flat, out_flat, w_at, depth, (i * xs,), (i * os + shift,))
+            i += 1
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def _fill_table(coords: Any, low: Any, shape: Any, table: Any, begin: int, end: int) -> None:
+    for n in range(begin, end):
+        cell = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (coords[n, 0] - low[0])
+        table[cell] = n
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel_size: int, step: int) -> Any:
+    """Find for every output site its input neighbours.
+
+    coords (N, 3) and queries (M, 3) int32 hold x, y, z of the input and output sites, cloud by cloud as `starts` and
+    `query_starts` (B + 1,) say. Kernel index k = ix + K iy + K^2 iz, offset (ix - K // 2, ...) times `step`.
+    Returns in_rows (P,), out_rows (P,) int32, sorted by kernel and then by output row, and first (K^3 + 1,) int64,
+    where each kernel's pairs begin.
+    """
+    radius = (kernel_size // 2) * step
+    n_kernels = kernel_size**3
+    n_clouds = len(starts) - 1
+    n_queries = len(queries)
+    n_inputs = len(coords)
+    found = np.full((n_kernels, n_queries), -1, np.int32)
+    first = np.zeros(n_kernels + 1, np.int64)
+    low = np.empty(3, np.int64)
+    high = np.empty(3, np.int64)
+    shape = np.empty(3, np.int64)
+    table = np.empty(0, np.int32)
+    for cloud in range(n_clouds):
+        begin, end = starts[cloud], starts[cloud + 1]
+        query_begin, query_end = query_starts[cloud], query_starts[cloud + 1]
+        if begin == end or query_begin == query_end:
+            continue
+        for axis in range(3):
+            low[axis] = min(coords[begin:end, axis].min(), queries[query_begin:query_end, axis].min()) - radius
+            high[axis] = max(coords[begin:end, axis].max(), queries[query_begin:query_end, axis].max()) + radius
+            shape[axis] = high[axis] - low[axis] + 1
+        cells = shape[0] * shape[1] * shape[2]
+        dense = float(shape[0]) * float(shape[1]) * float(shape[2]) <= MAX_DENSE_CELLS
+        if dense and cells > len(table):
+            table = np.full(cells, -1, np.int32)
+        keys = np.empty(end - begin, np.int64)
+        if dense:
+            _fill_table(coords, low, shape, table, begin, end)
+        else:
+            for n in range(begin, end):
+                keys[n - begin] = (
+                    (coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])
+                ) * shape[0] + (coords[n, 0] - low[0])
+            order = np.argsort(keys)
+            keys = keys[order]
+        base = np.empty(query_end - query_begin, np.int64)
+        for m in range(query_begin, query_end):
+            base[m - query_begin] = (
+                (queries[m, 2] - low[2]) * shape[1] + (queries[m, 1] - low[1])
+            ) * shape[0] + (queries[m, 0] - low[0])
+        k = 0
+        for iz in range(-radius, radius + 1, step):
+            for iy in range(-radius, radius + 1, step):
+                for ix in range(-radius, radius + 1, step):
+                    delta = (iz * shape[1] + iy) * shape[0] + ix
+                    count = 0
+                    if dense:
+                        for m in range(query_end - query_begin):
+                            n = table[base[m] + delta]
+                            found[k, query_begin + m] = n
+                            count += n >= 0
+                    else:
+                        for m in range(query_end - query_begin):
+                            at = np.searchsorted(keys, base[m] + delta)
+                            if at < len(keys) and keys[at] == base[m] + delta:
+                                found[k, query_begin + m] = begin + order[at]
+                                count += 1
+                    first[k + 1] += count
+                    k += 1
+        if dense:
+            for n in range(begin, end):
+                cell = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (
+                    coords[n, 0] - low[0]
+                )
+                table[cell] = -1
+    for k in range(n_kernels):
+        first[k + 1] += first[k]
+    in_rows = np.empty(first[n_kernels], np.int32)
+    out_rows = np.empty(first[n_kernels], np.int32)
+    p = 0
+    for k in range(n_kernels):
+        for m in range(n_queries):
+            n = found[k, m]
+            if n >= 0:
+                in_rows[p] = n
+                out_rows[p] = m
+                p += 1
+    assert n_inputs >= 0
+    return in_rows, out_rows, first
