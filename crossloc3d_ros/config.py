@@ -94,7 +94,7 @@ class CredibilityConfig:
     temperature: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
     none_distance: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
     none_scale: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
-    cluster_radius_m: float = option(50.0, "candidates this near to each other speak for one place", low=1.0, high=1000.0)
+    cluster_radius_m: float = option(50.0, "candidates this near to each other mean one place", low=1.0, high=1000.0)
     min_probability: float = option(0.5, "a fix needs this belief in one place", low=0.0, high=1.0)
     position_floor_m: float = option(25.0, "least standard deviation east and north", low=0.1, high=1000.0)
     height_floor_m: float = option(3.0, "least standard deviation of the height", low=0.1, high=1000.0)

@@ -1,0 +1,160 @@
+"""How far candidates can be believed: probabilities, the place they speak for, its covariance, and whether it is a fix.
+
+The belief has two parts. Whether the scan's place is in the map at all is told by the best descriptor distance
+(a logistic curve: indoors, or outside of the surveyed area, nothing lies near). Which place it is, if any, is told
+by the distances relative to each other (a softmax). Both curves are fitted by `calibrate` on scans of known places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, logsumexp, softmax
+
+from crossloc3d_ros.config import CalibrationConfig, CredibilityConfig
+from crossloc3d_ros.types import (
+    BoolArray,
+    CalibratedEncoder,
+    Candidates,
+    DescriptorEncoder,
+    FixStatus,
+    Float32Array,
+    Float64Array,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """The one place that the candidates speak for, and how far to believe it."""
+
+    status: FixStatus
+    reason: str
+    """One sentence for people."""
+    probability: float
+    """Share of belief in the place; what is missing to 1 lies in other places or outside of the map."""
+    enu: Float64Array
+    """(3,) metres, map frame."""
+    covariance: Float64Array
+    """(3, 3) ENU, square metres."""
+    members: BoolArray
+    """(k,) which candidates belong to the place."""
+
+
+def effective_calibration(config: CredibilityConfig, encoder: DescriptorEncoder) -> CalibrationConfig:
+    """Return the calibration that comes with the encoder's weights, as far as `config` does not override it."""
+    stored = encoder.calibration if isinstance(encoder, CalibratedEncoder) else None
+    base = stored if stored is not None else CalibrationConfig()
+    return CalibrationConfig(
+        temperature=config.temperature or base.temperature,
+        none_distance=config.none_distance or base.none_distance,
+        none_scale=config.none_scale or base.none_scale,
+    )
+
+
+def candidate_probabilities(distances: Float32Array, calibration: CalibrationConfig) -> Float64Array:
+    """Return each candidate's share of belief (k,); what is missing to 1 is the belief in none of them.
+
+    `distances` (k,) are Euclidean distances between descriptors.
+    """
+    if len(distances) == 0:
+        return np.empty(0)
+    distances_64 = np.asarray(distances, dtype=np.float64)
+    some = expit((calibration.none_distance - distances_64.min()) / calibration.none_scale)
+    return np.asarray(some * softmax(-distances_64 / calibration.temperature))
+
+
+def judge(candidates: Candidates, enu: Float64Array, config: CredibilityConfig) -> Belief:
+    """Find the place in which most of the belief lies, and say whether it is enough for a fix.
+
+    `enu` (k, 3) holds the candidates' positions in the map frame; k must be at least 1. The place is the group of
+    candidates within `cluster_radius_m` of one of them that holds the most belief; its position is their weighted
+    mean, its covariance their weighted spread on top of the floor that the size of a submap sets.
+    """
+    probabilities = candidates.probabilities
+    members = _heaviest_group(enu, probabilities, config.cluster_radius_m)
+    probability = float(probabilities[members].sum())
+    mean, covariance = _weighted_moments(enu[members], probabilities[members])
+    covariance += np.diag([config.position_floor_m**2, config.position_floor_m**2, config.height_floor_m**2])
+    # Written so that a belief that is not a number gives no fix.
+    is_fix = probability >= config.min_probability
+    return Belief(
+        status=FixStatus.FIX if is_fix else FixStatus.NO_FIX,
+        reason=_explain(candidates, enu, members, probability, is_fix),
+        probability=probability,
+        enu=mean,
+        covariance=covariance,
+        members=members,
+    )
+
+
+def calibrate(
+    distances: Sequence[Float32Array],
+    separations_m: Sequence[Float64Array],
+    *,
+    radius_m: float = 50.0,
+    start: CalibrationConfig | None = None,
+) -> CalibrationConfig:
+    """Fit the calibration to scans of known places by maximum likelihood.
+
+    `distances[i]` (k,) are the descriptor distances of scan i's candidates, `separations_m[i]` (k,) how far the
+    candidates lie from where the scan was taken: infinite for scans from outside of the map, which belong in here
+    so that the answer 'nowhere' is learned. A candidate is right within `radius_m`.
+    """
+    near = [np.asarray(d, dtype=np.float64) for d in distances]
+    right = [np.asarray(s, dtype=np.float64) <= radius_m for s in separations_m]
+    best = np.array([d.min() for d in near])
+    found = np.array([r.any() for r in right])
+    scale = float(np.std(best)) or 1.0
+    initial = start or CalibrationConfig(temperature=scale, none_distance=float(np.median(best)), none_scale=scale)
+
+    def presence_loss(x: Float64Array) -> float:
+        z = (x[0] - best) * np.exp(-x[1])
+        # A weak pull on the scale keeps it finite where the two kinds of scans separate perfectly.
+        return float(np.sum(np.logaddexp(0.0, np.where(found, -z, z))) + 1e-2 * (x[1] - np.log(scale)) ** 2)
+
+    def choice_loss(x: Float64Array) -> float:
+        logits = [-d * np.exp(-x[0]) for d in near]
+        losses = [logsumexp(v) - logsumexp(v[r]) for v, r, f in zip(logits, right, found, strict=True) if f]
+        return float(np.sum(losses) + 1e-2 * (x[0] - np.log(scale)) ** 2)
+
+    presence = minimize(presence_loss, [initial.none_distance, np.log(initial.none_scale)], method="Nelder-Mead").x
+    choice = minimize(choice_loss, [np.log(initial.temperature)], method="Nelder-Mead").x
+    return CalibrationConfig(
+        temperature=float(np.exp(choice[0])), none_distance=float(presence[0]), none_scale=float(np.exp(presence[1]))
+    )
+
+
+def _heaviest_group(enu: Float64Array, probabilities: Float64Array, radius_m: float) -> BoolArray:
+    """Mark the candidates (k,) within `radius_m` of the one around which most of the belief lies."""
+    offsets = enu[:, None, :2] - enu[None, :, :2]
+    near = np.hypot(offsets[..., 0], offsets[..., 1]) <= radius_m
+    group: BoolArray = near[np.argmax(near @ probabilities)]
+    return group
+
+
+def _weighted_moments(points: Float64Array, weights: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return mean (3,) and covariance (3, 3) of points (n, 3) with the given weights (n,), of any sum."""
+    total = weights.sum()
+    # Far from every descriptor all weights underflow to 0: then all members count alike.
+    shares = weights / total if total > 0 else np.full(len(points), 1.0 / len(points))
+    mean = shares @ points
+    offsets = points - mean
+    return mean, (offsets * shares[:, None]).T @ offsets
+
+
+def _explain(candidates: Candidates, enu: Float64Array, members: BoolArray, probability: float, is_fix: bool) -> str:
+    count, agreeing = len(candidates), int(members.sum())
+    if is_fix:
+        return f"{agreeing} of {count} candidates lie at one place, believed {probability:.0%}"
+    nowhere = 1.0 - float(candidates.probabilities.sum())
+    best = float(candidates.descriptor_distances[0])
+    if not probability >= nowhere or agreeing == count:
+        return f"nothing in the map looks like the scan: nearest descriptor at {best:.3g}, believed {1 - nowhere:.0%}"
+    others = np.flatnonzero(~members)
+    rival = others[np.argmax(candidates.probabilities[others])]
+    leader = np.flatnonzero(members)[np.argmax(candidates.probabilities[members])]
+    apart = float(np.hypot(*(enu[leader] - enu[rival])[:2]))
+    return f"best candidates lie {apart:.0f} m apart: the likeliest place is believed {probability:.0%} only"

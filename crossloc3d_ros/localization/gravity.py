@@ -1,0 +1,48 @@
+"""Which way is up, from an accelerometer."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from crossloc3d_ros.types import Float64Array
+
+PLAUSIBLE_MPS2 = (5.0, 15.0)
+"""An accelerometer at rest shows 9.8; what lies outside is a shock, another unit or a broken sensor."""
+STALE_NS = 1_000_000_000
+"""An average that has seen nothing for so long says nothing about the present."""
+
+
+class GravityFilter:
+    """Low-pass a stream of specific forces (m/s2, base frame, +z up at rest) into the direction that points up."""
+
+    def __init__(self, time_constant_s: float) -> None:
+        self._time_constant_ns = time_constant_s * 1e9
+        self._mean: Float64Array | None = None
+        self._stamp_ns = 0
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._mean = None
+
+    def update(self, stamp_ns: int, acceleration: Float64Array) -> bool:
+        """Take in one sample (3,) and return whether it was plausible; a stamp that goes backwards starts anew."""
+        low, high = PLAUSIBLE_MPS2
+        # Written so that NaN is refused too.
+        if not low <= float(np.linalg.norm(acceleration)) <= high:
+            return False
+        elapsed_ns = stamp_ns - self._stamp_ns
+        if self._mean is None or not 0 <= elapsed_ns <= STALE_NS:
+            self._mean = np.asarray(acceleration, dtype=np.float64)
+        else:
+            gain = 1.0 - math.exp(-elapsed_ns / self._time_constant_ns)
+            self._mean = self._mean + gain * (acceleration - self._mean)
+        self._stamp_ns = stamp_ns
+        return True
+
+    def up(self, stamp_ns: int) -> Float64Array | None:
+        """Return the unit vector (3,) that points up in the base frame; None where no recent sample tells it."""
+        if self._mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
+            return None
+        return np.asarray(self._mean / np.linalg.norm(self._mean))
