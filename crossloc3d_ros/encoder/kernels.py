@@ -31,7 +31,9 @@ def _make_tile(n_rows: int) -> Any:
 
     @intrinsic
     def tile(typingctx: Any, x: Any, w: Any, out: Any, w_at: Any, depth: Any, x_at: Any, out_at: Any) -> Any:
-        signature = types.void(x, w, out, types.intp, types.intp, types.UniTuple(types.intp, n_rows), types.UniTuple(types.intp, n_rows))
+        signature = types.void(
+            x, w, out, types.intp, types.intp, types.UniTuple(types.intp, n_rows), types.UniTuple(types.intp, n_rows)
+        )
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             single = ir.FloatType()
@@ -245,16 +247,16 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
             _fill_table(coords, low, shape, table, begin, end)
         else:
             for n in range(begin, end):
-                keys[n - begin] = (
-                    (coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])
-                ) * shape[0] + (coords[n, 0] - low[0])
+                keys[n - begin] = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (
+                    coords[n, 0] - low[0]
+                )
             order = np.argsort(keys)
             keys = keys[order]
         base = np.empty(query_end - query_begin, np.int64)
         for m in range(query_begin, query_end):
-            base[m - query_begin] = (
-                (queries[m, 2] - low[2]) * shape[1] + (queries[m, 1] - low[1])
-            ) * shape[0] + (queries[m, 0] - low[0])
+            base[m - query_begin] = ((queries[m, 2] - low[2]) * shape[1] + (queries[m, 1] - low[1])) * shape[0] + (
+                queries[m, 0] - low[0]
+            )
         k = 0
         for iz in range(-radius, radius + 1, step):
             for iy in range(-radius, radius + 1, step):

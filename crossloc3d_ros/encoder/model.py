@@ -248,9 +248,7 @@ class CrossLoc3D(nn.Module):
         features = [x for x, _ in encoded]
         batches = [grid.batch for _, grid in encoded]
         n_clouds = len(clouds)
-        fused_input = (
-            torch.cat(features) if self.refinement is None else self.refinement(features, batches, n_clouds)
-        )
+        fused_input = torch.cat(features) if self.refinement is None else self.refinement(features, batches, n_clouds)
         x = F.relu(self.fusion_norm(self.fusion(fused_input)))
         batch = torch.cat(batches)
         order = torch.argsort(batch, stable=True)
@@ -276,6 +274,8 @@ def check_model(config: ModelConfig) -> None:
         raise ConfigError(f"'voxel_sizes' must be positive and ascend, got {config.voxel_sizes}")
     if config.refinement != "none" and len(config.memory_sizes) < grains * config.sub_steps:
         needed = grains * config.sub_steps
-        raise ConfigError(f"'memory_sizes' must hold {needed} sizes (grains x sub-steps), got {len(config.memory_sizes)}")
+        raise ConfigError(
+            f"'memory_sizes' must hold {needed} sizes (grains x sub-steps), got {len(config.memory_sizes)}"
+        )
     if config.channels % config.heads:
         raise ConfigError(f"'channels' ({config.channels}) must be a multiple of 'heads' ({config.heads})")

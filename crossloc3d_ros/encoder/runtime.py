@@ -1,0 +1,73 @@
+"""The encoder as its users see it: points in, descriptors out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+from crossloc3d_ros.config import ModelConfig, PreprocessingConfig
+from crossloc3d_ros.encoder.model import CrossLoc3D
+from crossloc3d_ros.errors import CloudError
+from crossloc3d_ros.types import Float32Array
+
+
+class Encoder:
+    """Trained weights, ready to encode; one object serves any number of threads."""
+
+    def __init__(
+        self,
+        model: CrossLoc3D,
+        preprocessing: PreprocessingConfig,
+        fingerprint: str,
+        *,
+        metadata: Mapping[str, str] | None = None,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
+        self._model = model.eval().to(device)
+        self._device = device
+        self._threads = threads
+        self._preprocessing = preprocessing
+        self._fingerprint = fingerprint
+        self.metadata = dict(metadata or {})
+
+    @property
+    def fingerprint(self) -> str:
+        """Identify weights, model and preprocessing: a map answers only to the encoder that made it."""
+        return self._fingerprint
+
+    @property
+    def preprocessing(self) -> PreprocessingConfig:
+        """Return the preprocessing that the weights were trained on."""
+        return self._preprocessing
+
+    @property
+    def model_config(self) -> ModelConfig:
+        """Return the configuration of the network."""
+        return self._model.config
+
+    @property
+    def descriptor_size(self) -> int:
+        """Numbers in a descriptor."""
+        return self._model.config.descriptor_size
+
+    def encode(self, points: Float32Array) -> Float32Array:
+        """Return the descriptor (D,) of a patch's points (n, 3) in [-1, 1]."""
+        row: Float32Array = self.encode_batch([points])[0]
+        return row
+
+    def encode_batch(self, clouds: Sequence[Float32Array]) -> Float32Array:
+        """Return the descriptors (B, D) of B patches; each depends on its own points alone."""
+        for cloud in clouds:
+            if cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) == 0:
+                raise CloudError(f"a patch must be an array (n, 3) with n > 0, got {cloud.shape}")
+        with torch.no_grad():
+            tensors = [torch.from_numpy(np.ascontiguousarray(c, np.float32)).to(self._device) for c in clouds]
+            result: Float32Array = self._model(tensors).cpu().numpy()
+        return result
+
+    def warm_up(self) -> None:
+        """Compile and touch whatever makes the first call slow."""
+        self.encode(np.zeros((16, 3), np.float32))
