@@ -140,7 +140,7 @@ class Projection:
     def _plausible(self, points: Float64Array) -> BoolArray:
         """Say which points lie on the Earth at all: PROJ wraps absurd coordinates around it instead of refusing."""
         limit = np.array([360.0, 90.0]) if self._geographic else np.array([_FARTHEST_M, _FARTHEST_M]) / self._unit_m
-        return (np.abs(points[:, 0]) <= limit[0]) & (np.abs(points[:, 1]) <= limit[1])
+        return np.asarray((np.abs(points[:, :2]) <= limit).all(axis=1))
 
     def _horizontal(self, points: Float64Array) -> Float64Array:
         if len(points) < _FIT_FROM_POINTS:
@@ -257,7 +257,8 @@ class MapFrame:
         """Return the grid points (N, 3) of tangent-frame points (N, 3), the inverse of `to_enu`."""
         origin_ecef, R_enu_ecef = self._tangent
         ecef = enu @ R_enu_ecef + origin_ecef
-        longitude, latitude, height = _transformer_3d(_WGS84_ECEF, _WGS84_3D).transform(*ecef.T)
+        to_geographic = _transformer_3d(_WGS84_ECEF, _WGS84_3D)
+        longitude, latitude, height = to_geographic.transform(ecef[:, 0], ecef[:, 1], ecef[:, 2])
         easting, northing = _transformer(_WGS84_3D, self.crs).transform(longitude, latitude)
         return np.column_stack([easting, northing, height - (self.geoid_separation_m or 0.0)])
 
@@ -285,8 +286,8 @@ class MapFrame:
 def _grid_to_ecef(crs: str, geoid_separation_m: float, grid: Float64Array) -> Float64Array:
     longitude, latitude = _transformer(crs, _WGS84_3D).transform(grid[:, 0], grid[:, 1])
     height = grid[:, 2] + geoid_separation_m
-    x, y, z = _transformer_3d(_WGS84_3D, _WGS84_ECEF).transform(longitude, latitude, height)
-    return np.column_stack([x, y, z])
+    to_ecef = _transformer_3d(_WGS84_3D, _WGS84_ECEF)
+    return np.stack(to_ecef.transform(longitude, latitude, height), axis=-1)
 
 
 @lru_cache(maxsize=16)
