@@ -1,0 +1,151 @@
+"""Make places to learn from, learn from them, write the weights and their card."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+
+from crossloc3d_ros.cli import common
+from crossloc3d_ros.config import PlacesConfig, TrainConfig, check_value, from_dict
+from crossloc3d_ros.errors import ConfigError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+    common.set_up_logging(arguments.verbose)
+    return common.run(lambda: arguments.action(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="train", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    places = commands.add_parser("make-places", help="simulate towns, their surveys and scans in them")
+    places.add_argument("--towns", type=int, default=40, help="towns to learn from (default: 40)")
+    places.add_argument("--validation-towns", type=int, default=6, help="towns to validate on (default: 6)")
+    places.add_argument("--seed", type=int, default=1, help="another seed, other towns (default: 1)")
+    places.add_argument("--output", type=Path, required=True, help="folder; towns that lie in it already are kept")
+    places.add_argument("--config", type=Path, help="YAML file of which `places` and `train` are read")
+    places.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
+    places.set_defaults(action=_make_places)
+
+    run = commands.add_parser("run", help="train until the budget is used")
+    run.add_argument("--places", type=Path, required=True, help="folder of make-places")
+    run.add_argument("--output", type=Path, required=True, help="folder of the run")
+    budget = run.add_mutually_exclusive_group(required=True)
+    budget.add_argument("--budget-minutes", type=float, help="time on the clock, validation included")
+    budget.add_argument("--budget-steps", type=int, help="batches: the same run to the bit, however often resumed")
+    run.add_argument("--resume", action="store_true", help="go on with the run in --output")
+    run.add_argument("--config", type=Path, help="YAML file of which `train` is read")
+    common.add_options(run, TrainConfig)
+    run.set_defaults(action=_run)
+
+    export = commands.add_parser("export", help="write the weights of a run, also of one that is still going or was killed")
+    export.add_argument("run", type=Path, help="folder of the run")
+    export.add_argument("--places", type=Path, help="folder of make-places, if it has moved")
+    export.add_argument("--output", type=Path, required=True, help="file to write (.safetensors); the card lies beside it")
+    export.set_defaults(action=_export)
+    for command in (places, run, export):
+        common.add_verbosity(command)
+    return parser
+
+
+def _make_places(arguments: argparse.Namespace) -> int:
+    from crossloc3d_ros.training.places import make_places
+
+    console = common.console()
+    document = _read_yaml(arguments.config)
+    manifest = make_places(
+        arguments.output,
+        towns=arguments.towns,
+        validation_towns=arguments.validation_towns,
+        seed=arguments.seed,
+        config=from_dict(PlacesConfig, document.get("places", {}), where="places."),
+        preprocessing=from_dict(TrainConfig, document.get("train", {}), where="train.").preprocessing,
+        workers=arguments.workers,
+        report=lambda made: console.print(
+            f"{made.done:4d} of {made.total} towns  {made.town.family:<12} {made.town.scans:4d} scans  "
+            f"{made.town.submaps:4d} submaps  {made.town.seconds:5.1f} s  ends in {_duration(made.remaining_s)}"
+        ),
+    )
+    print(f"{arguments.output}: {sum(t.scans for t in manifest.towns):,} scans in {len(manifest.towns)} towns")
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from crossloc3d_ros.training.loop import Budget, Trainer
+
+    budget = Budget(minutes=arguments.budget_minutes, steps=arguments.budget_steps)
+    config = _train_config(arguments)
+    trainer = Trainer(config, arguments.places, arguments.output, budget, report=_progress(common.console()))
+    validation = trainer.run(resume=arguments.resume)
+    trainer.write_card()
+    for recall in validation.recalls:
+        print(f"{recall.label:>5} within {recall.radius_m:3.0f} m: {100 * recall.value:5.1f} %  (chance {100 * recall.chance:.1f} %)")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from crossloc3d_ros.training.loop import export_run
+
+    card = export_run(arguments.run, arguments.output, arguments.places)
+    print(f"{arguments.output}\n{card}")
+    return 0
+
+
+def _train_config(arguments: argparse.Namespace) -> TrainConfig:
+    config = from_dict(TrainConfig, _read_yaml(arguments.config).get("train", {}), where="train.")
+    fields = {f.name: f for f in dataclasses.fields(TrainConfig)}
+    given = {name: getattr(arguments, name) for name in fields if getattr(arguments, name, None) is not None}
+    for name, value in given.items():
+        check_value(name, type(value), value, fields[name].metadata)
+    return dataclasses.replace(config, **given)
+
+
+def _read_yaml(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        document = yaml.safe_load(path.read_text()) or {}
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    if not isinstance(document, dict) or not document.keys() <= {"places", "train"}:
+        raise ConfigError(f"{path} must hold the groups 'places' and 'train' and nothing else")
+    return document
+
+
+def _progress(console: Console) -> Any:
+    def show(progress: Any) -> None:
+        line = (
+            f"{100 * progress.share:5.1f} %  step {progress.step:6,}  loss {progress.loss:7.4f}  "
+            f"rate {progress.learning_rate:.1e}"
+        )
+        if progress.validation is None:
+            console.print(
+                f"{line}  {progress.samples_per_second:5.1f} clouds/s  ends in {_duration(progress.remaining_s)}"
+            )
+        else:
+            near, far = progress.validation.recall("R@1", 25.0), progress.validation.recall("R@1", 100.0)
+            most = progress.validation.recall("R@25", 100.0)
+            console.print(
+                f"{line}  validation: R@1 {100 * far.value:.1f} % at 100 m (chance {100 * far.chance:.1f} %), "
+                f"{100 * near.value:.1f} % at 25 m; R@25 {100 * most.value:.1f} % at 100 m"
+            )
+
+    return show
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,189 @@
+"""What a training run leaves on disk: its settings, its log, the state to go on from, and the weights.
+
+Every file is written beside its place and moved into it, so that a kill or a full disk never costs the one before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from crossloc3d_ros.config import TrainConfig, from_dict, to_dict
+from crossloc3d_ros.encoder.checkpoint import save_checkpoint
+from crossloc3d_ros.encoder.model import CrossLoc3D
+from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.training.shards import Manifest, write_text
+from crossloc3d_ros.training.validation import QUANTILES, Validation
+
+SETTINGS = "run.json"
+STATE = "state.pt"
+LOG = "log.jsonl"
+BEST = "best.safetensors"
+FINAL = "final.safetensors"
+MODEL_CARD = "MODEL_CARD.md"
+
+_FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "log_steps"}
+"""Settings that a resumed run may change: they do not touch the weights."""
+
+
+def prepare(folder: Path, config: TrainConfig, manifest: Manifest, places: Path, *, resume: bool) -> None:
+    """Make the folder of a new run, or check that the one to resume has the same settings and places."""
+    settings = {"config": to_dict(config), "places": str(places), "places_sha256": places_hash(manifest)}
+    path = folder / SETTINGS
+    if not resume:
+        if path.exists():
+            raise TrainingError(f"{folder} holds a run already: go on with it by `--resume`, or name another folder")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrainingError(f"cannot make {folder}: {error.strerror or error}") from error
+        write_text(path, json.dumps(settings, indent=1) + "\n")
+        return
+    before = read_settings(folder)
+    if before["places_sha256"] != settings["places_sha256"]:
+        raise TrainingError(f"the run in {folder} learned from other places than those in {places}")
+    for key, value in settings["config"].items():
+        old = json.loads(json.dumps(before["config"].get(key)))
+        if key not in _FREE_TO_CHANGE and old != json.loads(json.dumps(value)):
+            raise TrainingError(f"the run in {folder} has '{key}' {old}, not {value}: a resumed run keeps its settings")
+    for leftover in folder.glob(".*.partial"):
+        leftover.unlink(missing_ok=True)
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Return what `prepare` wrote; raises TrainingError where the folder holds no run."""
+    path = folder / SETTINGS
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+        return {key: content[key] for key in ("config", "places", "places_sha256")}
+    except FileNotFoundError as error:
+        raise TrainingError(f"{folder} holds no training run") from error
+    except (OSError, ValueError, KeyError) as error:
+        raise TrainingError(f"{path} is damaged ({error})") from error
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """Return the configuration of a run."""
+    return from_dict(TrainConfig, read_settings(folder)["config"])
+
+
+def places_hash(manifest: Manifest) -> str:
+    """Identify a set of places by how it was made."""
+    towns = [(t.file, t.role, t.scans, t.submaps) for t in manifest.towns]
+    text = json.dumps([dict(manifest.settings), towns], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def save_state(folder: Path, state: dict[str, Any]) -> None:
+    """Write the state, whole or not at all."""
+    partial = folder / f".{STATE}.partial"
+    try:
+        with partial.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(folder / STATE)
+    except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
+        partial.unlink(missing_ok=True)
+        raise TrainingError(f"cannot write the state of the run into {folder}: {error}") from error
+
+
+def load_state(folder: Path) -> dict[str, Any] | None:
+    """Read the state; None where a run was killed before its first one was written."""
+    path = folder / STATE
+    try:
+        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        return None
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise TrainingError(f"{path} cannot be read ({error}); start the run anew in another folder") from error
+    return content
+
+
+class Log:
+    """The run's log, one JSON object a line: what happened, at which step, after how many seconds."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        """Open the log for appending; lines beyond `step` belong to work that was lost by a kill and go."""
+        self._path = folder / LOG
+        lines = [json.dumps(entry) for entry in read_log(folder) if entry["step"] <= step]
+        if lines or self._path.exists():
+            write_text(self._path, "".join(f"{line}\n" for line in lines))
+
+    def write(self, kind: str, **values: Any) -> None:
+        """Append one entry."""
+        try:
+            with self._path.open("a") as file:
+                file.write(json.dumps({"kind": kind, **values}) + "\n")
+        except OSError as error:
+            raise TrainingError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """Return the entries of a run's log; a last line that a kill cut off is left out."""
+    path = folder / LOG
+    entries = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            entries.append(json.loads(line))
+        except ValueError:
+            continue
+    return entries
+
+
+def machine(config: TrainConfig) -> dict[str, str]:
+    """Return what the run is done on and with."""
+    processor = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        processor = names[0] if names else processor
+    return {
+        "processor": processor,
+        "cores": str(os.cpu_count()),
+        "threads": str(config.threads),
+        "accelerator": torch.cuda.get_device_name() if config.device == "cuda" else "none",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def metadata(config: TrainConfig, step: int, elapsed_s: float, validation: Validation) -> dict[str, str]:
+    """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
+
+    `calibration` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on
+    the held-out towns: what a localizer sets its absolute gate by.
+    """
+    calibration = {
+        "quantiles": QUANTILES,
+        "true_match": validation.true_distances,
+        "best_false_match": validation.false_distances,
+        "queries": validation.queries,
+        "submaps": validation.submaps,
+    }
+    recalls = {f"{r.label}@{r.radius_m:.0f}m": round(r.value, 4) for r in validation.recalls}
+    training = {"steps": step, "hours": round(elapsed_s / 3600.0, 3), "pairs": config.pairs, "seed": config.seed}
+    return {
+        "calibration": json.dumps(calibration),
+        "validation": json.dumps(recalls),
+        "training": json.dumps({**training, "loss": config.loss}),
+    }
+
+
+def export(path: Path, model: CrossLoc3D, config: TrainConfig, extra: dict[str, str]) -> None:
+    """Write weights as float16 safetensors with model, preprocessing and `extra` inside, whole or not at all."""
+    try:
+        save_checkpoint(path, model, config.preprocessing, extra, dtype="float16")
+    except OSError as error:
+        raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
+
+

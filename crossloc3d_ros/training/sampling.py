@@ -1,0 +1,183 @@
+"""Batches of matching places: a pure function of the seed and the step, so that a resumed run draws the same ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from crossloc3d_ros.clouds.patch import make_patch
+from crossloc3d_ros.config import TrainConfig
+from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.training.shards import TrainingTown
+from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
+
+_CELL_M = 10.0
+_ATTEMPTS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """P scans and the P submaps that they lie in."""
+
+    scans: list[Float32Array]
+    """P patches (n, 3)."""
+    submaps: list[Float32Array]
+    """P patches (n, 3); row i belongs to scan i."""
+    ignored: BoolArray
+    """(P, P) pairs of one town too near to call different and not the same; False on the diagonal."""
+
+
+class PointField:
+    """A town's above-ground points in square cells, for cutting turned squares quickly."""
+
+    def __init__(self, points: Float32Array) -> None:
+        low = points[:, :2].min(axis=0)
+        columns, rows = np.floor((points[:, :2].max(axis=0) - low) / _CELL_M).astype(np.int64) + 1
+        cell = np.floor((points[:, :2] - low) / _CELL_M).astype(np.int64)
+        flat = cell[:, 1] * columns + cell[:, 0]
+        order = np.argsort(flat, kind="stable")
+        self._points = np.ascontiguousarray(points[order])
+        self._starts = np.searchsorted(flat[order], np.arange(rows * columns + 1)).astype(np.int64)
+        self._low = low.astype(np.float64)
+        self._columns, self._rows = int(columns), int(rows)
+
+    def cut(self, centre: Float64Array, heading_rad: float, half_extent_m: float) -> Float32Array:
+        """Return the points (n, 3) of the square around `centre` (2,) as seen along a heading, x and y from the centre."""
+        return _cut(
+            self._points,
+            self._starts,
+            self._columns,
+            self._rows,
+            float(centre[0]),
+            float(centre[1]),
+            float(self._low[0]),
+            float(self._low[1]),
+            heading_rad,
+            half_extent_m,
+        )
+
+
+class BatchSampler:
+    """Draws batches from towns; several pairs come from each town, so that some negatives are hard."""
+
+    def __init__(self, towns: Sequence[TrainingTown], config: TrainConfig) -> None:
+        if not towns or not any(len(town) for town in towns):
+            raise TrainingError("there is no scan to learn from: the training places are empty")
+        self._towns = [town for town in towns if len(town)]
+        self._fields = [PointField(town.survey_points) for town in self._towns]
+        self._config = config
+
+    def batch(self, step: int) -> Batch:
+        """Return the batch of a step, the same at every call."""
+        rng = np.random.default_rng((self._config.seed, step))
+        config = self._config
+        drawn = min(config.towns_a_batch, len(self._towns), config.pairs)
+        chosen = rng.choice(len(self._towns), drawn, replace=False)
+        scans: list[Float32Array] = []
+        submaps: list[Float32Array] = []
+        owners = np.sort(np.arange(config.pairs) % drawn)
+        positions = np.empty((config.pairs, 2))
+        for i, owner in enumerate(owners):
+            town = int(chosen[owner])
+            scan, submap, positions[i] = self._pair(town, rng, positions[:i][owners[:i] == owner])
+            scans.append(scan)
+            submaps.append(submap)
+        apart = np.hypot(*(positions[:, None] - positions[None]).transpose(2, 0, 1))
+        ignored = (owners[:, None] == owners[None, :]) & (apart < config.neighbour_m)
+        np.fill_diagonal(ignored, False)
+        return Batch(scans, submaps, ignored)
+
+    def _pair(
+        self, town_index: int, rng: np.random.Generator, taken: Float64Array
+    ) -> tuple[Float32Array, Float32Array, Float64Array]:
+        """Return a scan, a submap that it lies in and the scan's place, if possible away from the places `taken`."""
+        town, field, config = self._towns[town_index], self._fields[town_index], self._config
+        preprocessing = config.preprocessing
+        for attempt in range(_ATTEMPTS):
+            index = int(rng.integers(len(town)))
+            place = town.scan_xy_m[index]
+            far = len(taken) == 0 or float(np.hypot(*(taken - place).T).min()) >= config.neighbour_m
+            if not far and attempt < _ATTEMPTS // 5:
+                continue
+            mirrored = bool(rng.integers(2))
+            scan_points = _augment(town.scan_points(index), rng, config)
+            scan_points = _turn(scan_points, float(rng.uniform(0.0, 2.0 * math.pi)))
+            centre = place + rng.uniform(-config.offset_m, config.offset_m, 2)
+            heading = float(rng.uniform(0.0, 2.0 * math.pi))
+            submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
+            if mirrored:
+                scan_points[:, 1] *= -1.0
+                submap_points[:, 1] *= -1.0
+            scan = make_patch(scan_points, preprocessing.scan_half_extent_m, preprocessing)
+            submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
+            if scan is not None and submap is not None:
+                return scan.points, submap.points, place
+        raise TrainingError(
+            f"{town.name}: {_ATTEMPTS} scans in a row gave no pair of patches with at least "
+            f"{preprocessing.min_points} points; lower min_points or make other places"
+        )
+
+
+def _augment(points: Float32Array, rng: np.random.Generator, config: TrainConfig) -> Float32Array:
+    """Return a copy without some of the points: dropouts, and at times a sector that something large blocks."""
+    kept = rng.random(len(points)) < rng.uniform(config.keep_points, 1.0)
+    if rng.random() < config.sector_share:
+        bearing = np.arctan2(points[:, 1], points[:, 0])
+        width = rng.uniform(0.0, math.pi / 2.0)
+        kept &= np.mod(bearing - rng.uniform(0.0, 2.0 * math.pi), 2.0 * math.pi) >= width
+    return points[kept]
+
+
+def _turn(points: Float32Array, angle_rad: float) -> Float32Array:
+    """Return the points turned about z."""
+    cosine, sine = np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad))
+    turned = np.empty_like(points)
+    turned[:, 0] = cosine * points[:, 0] - sine * points[:, 1]
+    turned[:, 1] = sine * points[:, 0] + cosine * points[:, 1]
+    turned[:, 2] = points[:, 2]
+    return turned
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _cut(
+    points: Float32Array,
+    starts: Int64Array,
+    columns: int,
+    rows: int,
+    east: float,
+    north: float,
+    low_east: float,
+    low_north: float,
+    heading_rad: float,
+    half_extent_m: float,
+) -> Float32Array:
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    reach = half_extent_m * (abs(cosine) + abs(sine))
+    first_column = max(0, int(np.floor((east - reach - low_east) / 10.0)))
+    last_column = min(columns - 1, int(np.floor((east + reach - low_east) / 10.0)))
+    first_row = max(0, int(np.floor((north - reach - low_north) / 10.0)))
+    last_row = min(rows - 1, int(np.floor((north + reach - low_north) / 10.0)))
+    most = 0
+    for row in range(first_row, last_row + 1):
+        if first_column <= last_column:
+            most += starts[row * columns + last_column + 1] - starts[row * columns + first_column]
+    cut = np.empty((most, 3), np.float32)
+    count = 0
+    for row in range(first_row, last_row + 1):
+        if first_column > last_column:
+            break
+        for i in range(starts[row * columns + first_column], starts[row * columns + last_column + 1]):
+            de = points[i, 0] - east
+            dn = points[i, 1] - north
+            x = cosine * de + sine * dn
+            y = cosine * dn - sine * de
+            if abs(x) <= half_extent_m and abs(y) <= half_extent_m:
+                cut[count, 0] = x
+                cut[count, 1] = y
+                cut[count, 2] = points[i, 2]
+                count += 1
+    return cut[:count].copy()

@@ -1,0 +1,141 @@
+"""Recall on towns that training never sees, and the distances that separate right from wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crossloc3d_ros.training.shards import ValidationTown
+from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
+
+RADII_M = (100.0, 50.0, 25.0)
+TOP = (1, 5, 25)
+QUANTILES = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Positions of several towns in one database; places of different towns are never the same."""
+
+    town: Int64Array
+    """(N,) which town."""
+    xy_m: Float64Array
+    """(N, 2) in the town's own frame."""
+
+
+@dataclass(frozen=True)
+class Recall:
+    """Share of queries with a submap within `radius_m` among the nearest `count` by descriptor."""
+
+    radius_m: float
+    count: int
+    label: str
+    """`R@5`, or `R@1%` where the count is that share of the database."""
+    value: float
+    chance: float
+    """What a random order would reach."""
+    low: float
+    """95 % Wilson interval over the queries, as if they were independent."""
+    high: float
+
+
+@dataclass(frozen=True)
+class Validation:
+    """One look at the held-out towns: aerial database, ground queries, headings over the full circle."""
+
+    queries: int
+    submaps: int
+    recalls: tuple[Recall, ...]
+    true_distances: tuple[float, ...]
+    """Quantiles (`QUANTILES`) of the descriptor distance from a scan to the submap that is centred nearest."""
+    false_distances: tuple[float, ...]
+    """The same to the nearest descriptor among the submaps more than 100 m away."""
+
+    def recall(self, label: str, radius_m: float) -> Recall:
+        """Return one figure, as `recall("R@1", 100.0)`."""
+        return next(r for r in self.recalls if r.label == label and r.radius_m == radius_m)
+
+
+def ground_distances(queries: Places, submaps: Places) -> Float64Array:
+    """Return the distances (Q, M) in metres on the ground, infinite between towns."""
+    offsets = queries.xy_m[:, None, :] - submaps.xy_m[None, :, :]
+    distances: Float64Array = np.hypot(offsets[..., 0], offsets[..., 1])
+    distances[queries.town[:, None] != submaps.town[None, :]] = math.inf
+    return distances
+
+
+def wilson_interval(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Return the 95 % interval of a share."""
+    if count == 0:
+        return 0.0, 1.0
+    share = hits / count
+    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validation:
+    """Return recall and distances from both (Q, M) matrices: descriptor units and metres on the ground.
+
+    Queries without any submap within a radius do not count for that radius.
+    """
+    queries, submaps = metres.shape
+    order = np.argsort(descriptor_distances, axis=1, kind="stable")
+    ranked_metres = np.take_along_axis(metres, order, axis=1)
+    recalls = []
+    one_per_cent = max(1, math.ceil(submaps / 100))
+    for radius_m in RADII_M:
+        right = ranked_metres <= radius_m
+        possible = right.any(axis=1)
+        right = right[possible]
+        first = right.argmax(axis=1)
+        matches = right.sum(axis=1)
+        for label, count in [*((f"R@{k}", k) for k in TOP), ("R@1%", one_per_cent)]:
+            hits = int((first < count).sum())
+            chance = float(np.mean([_chance(int(m), submaps, count) for m in matches])) if len(matches) else 0.0
+            low, high = wilson_interval(hits, len(first))
+            recalls.append(Recall(radius_m, count, label, hits / max(1, len(first)), chance, low, high))
+    true = np.take_along_axis(descriptor_distances, metres.argmin(axis=1)[:, None], axis=1)[:, 0]
+    false = np.where(metres > max(RADII_M), descriptor_distances, math.inf).min(axis=1)
+    return Validation(
+        queries=queries,
+        submaps=submaps,
+        recalls=tuple(recalls),
+        true_distances=_quantiles(true),
+        false_distances=_quantiles(false),
+    )
+
+
+def validate(towns: Sequence[ValidationTown], encode: Callable[[list[Float32Array]], Float32Array]) -> Validation:
+    """Encode all queries and submaps of the held-out towns into one database and score the retrieval.
+
+    `encode` turns patches (n, 3) into descriptors (B, D).
+    """
+    query_places = Places(_towns([len(t.query_xy_m) for t in towns]), np.concatenate([t.query_xy_m for t in towns]))
+    submap_places = Places(_towns([len(t.submap_xy_m) for t in towns]), np.concatenate([t.submap_xy_m for t in towns]))
+    queries = encode([patch for town in towns for patch in town.query_patches]).astype(np.float64)
+    submaps = encode([patch for town in towns for patch in town.submap_patches]).astype(np.float64)
+    squares = (queries**2).sum(1)[:, None] + (submaps**2).sum(1)[None, :] - 2.0 * queries @ submaps.T
+    return score(np.sqrt(np.maximum(squares, 0.0)), ground_distances(query_places, submap_places))
+
+
+def _quantiles(distances: Float64Array) -> tuple[float, ...]:
+    """Return the quantiles of what is finite: small towns may have no submap that is far away."""
+    finite = distances[np.isfinite(distances)]
+    return tuple(np.quantile(finite, QUANTILES).round(5).tolist()) if len(finite) else ()
+
+
+def _towns(counts: Sequence[int]) -> Int64Array:
+    return np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+
+
+def _chance(matches: int, submaps: int, count: int) -> float:
+    """Return the probability that `count` of `submaps` drawn at random hold one of the `matches`."""
+    if matches + count > submaps:
+        return 1.0
+    miss = math.lgamma(submaps - matches + 1) - math.lgamma(submaps - matches - count + 1)
+    miss += math.lgamma(submaps - count + 1) - math.lgamma(submaps + 1)
+    return 1.0 - math.exp(miss)

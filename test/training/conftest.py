@@ -1,0 +1,133 @@
+"""Small made-up towns: boxes on a plain, seen from above and, in part, from within."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crossloc3d_ros.clouds.patch import make_patch
+from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
+from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
+from crossloc3d_ros.training.shards import (
+    Manifest,
+    TownEntry,
+    TrainingTown,
+    ValidationTown,
+    write_manifest,
+    write_town,
+)
+from crossloc3d_ros.types import Float32Array, Float64Array
+
+SIZE_M = 220.0
+
+TINY = ModelConfig(
+    voxel_sizes=(0.1, 0.4), channels=16, sub_steps=1, memory_sizes=(16, 16), fused_channels=32, clusters=8,
+    descriptor_size=32,
+)  # fmt: skip
+TINY_TRAINING = TrainConfig(
+    pairs=8,
+    towns_a_batch=4,
+    learning_rate=3e-3,
+    model=TINY,
+    preprocessing=PreprocessingConfig(n_points=512, min_points=32),
+    log_steps=2,
+)
+
+
+def boxes(rng: np.random.Generator, count: int = 14) -> Float32Array:
+    """Return points (N, 3) on the walls of random boxes."""
+    parts = []
+    for _ in range(count):
+        centre, half, height = rng.uniform(0, SIZE_M, 2), rng.uniform(3, 14, 2), rng.uniform(4, 25)
+        wall = rng.uniform(-1, 1, (900, 2))
+        wall[np.arange(900), rng.integers(0, 2, 900)] = rng.choice([-1.0, 1.0], 900)
+        parts.append(np.column_stack([centre + wall * half, rng.uniform(0.6, height, 900)]))
+    return np.concatenate(parts).astype(np.float32)
+
+
+def scan_of(points: Float32Array, place: Float64Array, rng: np.random.Generator) -> Float32Array:
+    """Return some of the points around a place, turned to a random heading."""
+    around = points - np.array([*place, 0.0], np.float32)
+    around = around[np.hypot(around[:, 0], around[:, 1]) < 70.0]
+    around = around[rng.random(len(around)) < 0.7]
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    around[:, :2] = around[:, :2] @ turn.T
+    return around.astype(np.float32)
+
+
+def training_town(seed: int, scans: int = 30) -> TrainingTown:
+    """Return a made-up town to learn from."""
+    rng = np.random.default_rng(seed)
+    points = boxes(rng)
+    places = rng.uniform(55, SIZE_M - 55, (scans, 2))
+    seen = [np.round(scan_of(points, place, rng) * 100).astype(np.int16) for place in places]
+    starts = np.cumsum([0, *(len(s) for s in seen)]).astype(np.int64)
+    return TrainingTown(f"town{seed}", places, np.concatenate(seen), starts, points)
+
+
+def validation_town(seed: int, config: PreprocessingConfig, queries: int = 12) -> ValidationTown:
+    """Return a made-up town to validate on."""
+    rng = np.random.default_rng(seed)
+    points = boxes(rng)
+    cutter = SubmapCutter(points.astype(np.float64), config)
+    centres = submap_centres((50.0, 50.0, SIZE_M - 50.0, SIZE_M - 50.0), 19.0)
+    cut = [(c, patch.points) for c in centres if (patch := cutter.cut(c)) is not None]
+    asked = []
+    for place in rng.uniform(55, SIZE_M - 55, (queries, 2)):
+        patch = make_patch(scan_of(points, place, rng), config.scan_half_extent_m, config)
+        if patch is not None:
+            asked.append((place, patch.points))
+    return ValidationTown(
+        f"town{seed}",
+        np.array([a for a, _ in asked]),
+        np.array([p for _, p in asked]),
+        np.array([c for c, _ in cut]),
+        np.array([p for _, p in cut]),
+    )
+
+
+@pytest.fixture
+def tiny() -> TrainConfig:
+    """Give the settings of a run that takes seconds."""
+    return TINY_TRAINING
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Path:
+    """Give a folder of made-up places: four towns to learn from, one to validate on."""
+    return write_places(tmp_path / "places")
+
+
+def write_places(folder: Path, towns: int = 4) -> Path:
+    """Write made-up places."""
+    folder.mkdir()
+    entries = []
+    for seed in range(towns):
+        town = training_town(seed)
+        write_town(folder / f"train_{seed}.npz", town)
+        entries.append(TownEntry(f"train_{seed}.npz", "train", "boxes", seed, len(town), 0, 1.0))
+    held_out = validation_town(1000, TINY_TRAINING.preprocessing)
+    write_town(folder / "validation_1000.npz", held_out)
+    entries.append(
+        TownEntry("validation_1000.npz", "validation", "boxes", 1000, len(held_out.query_xy_m), len(held_out.submap_xy_m), 1.0)
+    )
+    settings = {
+        "towns": towns,
+        "validation_towns": 1,
+        "seed": 0,
+        "places": {},
+        "preprocessing": dataclasses.asdict(TINY_TRAINING.preprocessing),
+    }
+    write_manifest(folder, Manifest(settings, tuple(entries)))
+    return folder
+
+
+@pytest.fixture
+def make_training_town() -> Callable[..., TrainingTown]:
+    """Give the maker of made-up towns."""
+    return training_town
