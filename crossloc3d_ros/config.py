@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
@@ -229,3 +229,45 @@ def check_value(name: str, hint: Any, value: Any, metadata: Mapping[str, Any]) -
         if not ((low is None or value >= low) and (high is None or value <= high)):
             raise ConfigError(f"'{name}' must lie between {low} and {high}, got {value}")
     return value
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One plain field of a configuration, however deep."""
+
+    name: str
+    """Dotted path, such as `scan.mounting.z_m`."""
+    hint: Any
+    default: Any
+    metadata: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The sentence that describes it."""
+        return str(self.metadata.get("text", ""))
+
+    @property
+    def low(self) -> float | None:
+        """Least value of a number, or of each number of a list."""
+        return self.metadata.get("low")
+
+    @property
+    def high(self) -> float | None:
+        """Largest value of a number, or of each number of a list."""
+        return self.metadata.get("high")
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The texts to choose from, where they are limited."""
+        return typing.get_args(self.hint) if typing.get_origin(self.hint) is Literal else ()
+
+
+def settings_of(kind: type[Any], prefix: str = "") -> Iterator[Setting]:
+    """Yield the plain fields of a configuration dataclass and of the groups that it holds."""
+    hints = typing.get_type_hints(kind)
+    for item in dataclasses.fields(kind):
+        hint = hints[item.name]
+        if dataclasses.is_dataclass(hint):
+            yield from settings_of(typing.cast(type[Any], hint), f"{prefix}{item.name}.")
+        else:
+            yield Setting(f"{prefix}{item.name}", hint, item.default, item.metadata)

@@ -15,7 +15,10 @@ STALE_NS = 1_000_000_000
 
 
 class GravityFilter:
-    """Low-pass a stream of specific forces (m/s2, base frame, +z up at rest) into the direction that points up."""
+    """Low-pass a stream of specific forces (m/s2, base frame, +z up at rest) into the direction that points up.
+
+    One thread may feed it while another asks.
+    """
 
     def __init__(self, time_constant_s: float) -> None:
         self._time_constant_ns = time_constant_s * 1e9
@@ -43,6 +46,7 @@ class GravityFilter:
 
     def up(self, stamp_ns: int) -> Float64Array | None:
         """Return the unit vector (3,) that points up in the base frame; None where no recent sample tells it."""
-        if self._mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
+        mean = self._mean  # read once: another thread may take in samples or reset meanwhile
+        if mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
             return None
-        return np.asarray(self._mean / np.linalg.norm(self._mean))
+        return np.asarray(mean / np.linalg.norm(mean))

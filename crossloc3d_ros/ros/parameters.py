@@ -1,0 +1,140 @@
+"""ROS parameters made from a configuration dataclass: names, defaults, descriptions and ranges are the fields' own."""
+
+from __future__ import annotations
+
+import array
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from crossloc3d_ros.config import Setting, check_value, from_dict, settings_of
+from crossloc3d_ros.errors import ConfigError
+
+T = TypeVar("T")
+
+_EVERY_NODES_OWN = ("use_sim_time", "start_type_description_service")
+_CLIENT_LIBRARYS_TOPICS = ("/clock", "/parameter_events", "/rosout")
+
+
+def descriptor_of(setting: Setting) -> ParameterDescriptor:
+    """Return a setting's description and range as ROS shows and enforces them."""
+    descriptor = ParameterDescriptor(description=setting.text)
+    low, high = setting.low, setting.high
+    if setting.choices:
+        descriptor.additional_constraints = f"one of: {', '.join(setting.choices)}"
+    elif low is None or high is None:
+        pass  # every number has both; what has none is text or a switch
+    elif setting.hint is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+    elif setting.hint is float:
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        descriptor.floating_point_range = [bounds]
+    else:
+        descriptor.additional_constraints = f"each value between {low} and {high}"
+    return descriptor
+
+
+class ConfigParameters(Generic[T]):
+    """The parameters of a node that mirror one configuration dataclass, and that configuration as it stands now.
+
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`: that is how overrides
+    from files and command lines show that no field answers to, and they are refused.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type[T],
+        *,
+        topics: Sequence[str] = (),
+        why_fixed: Callable[[str], str | None] = lambda name: None,
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Declare every field; raises ConfigError naming each override that is unknown or out of range.
+
+        `topics` are the fully qualified topics whose QoS may be overridden. `why_fixed(name)` says why a parameter
+        cannot be changed now, or None; `on_change` is called after a change.
+        """
+        self._node = node
+        self._kind = kind
+        self._settings = {setting.name: setting for setting in settings_of(kind)}
+        self._topics = (*topics, *_CLIENT_LIBRARYS_TOPICS)
+        self._why_fixed = why_fixed
+        self._on_change = on_change
+        self._declare(self._overrides())
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._changed)
+
+    @property
+    def config(self) -> T:
+        """Return the configuration that the parameters' values make; raises ConfigError."""
+        return from_dict(self._kind, _nested({name: self._value(name) for name in self._settings}))
+
+    def _overrides(self) -> dict[str, Any]:
+        given = {name: self._value(name) for name in self._node.list_parameters([], 0).result.names}
+        unknown = [name for name in given if name not in self._settings and not self._is_ros_own(name)]
+        if unknown:
+            raise ConfigError("; ".join(self._unknown(name) for name in unknown))
+        return {name: value for name, value in given.items() if name in self._settings}
+
+    def _is_ros_own(self, name: str) -> bool:
+        if name in _EVERY_NODES_OWN:
+            return True
+        return any(name.startswith(f"qos_overrides.{topic}.") for topic in self._topics)
+
+    def _unknown(self, name: str) -> str:
+        known = list(self._settings)
+        if name.startswith("qos_overrides."):
+            return f"unknown parameter '{name}': QoS can be overridden for {', '.join(self._topics)}"
+        close = difflib.get_close_matches(name, known, n=1)
+        return f"unknown parameter '{name}'" + (f": did you mean '{close[0]}'?" if close else "")
+
+    def _declare(self, overrides: Mapping[str, Any]) -> None:
+        from_dict(self._kind, _nested(overrides))
+        for name, setting in self._settings.items():
+            value = setting.default
+            if name in overrides:
+                # Once more for its own sake: an integer is turned into the float that the field holds.
+                value = check_value(name, setting.hint, overrides[name], setting.metadata)
+                self._node.undeclare_parameter(name)
+            value = list(value) if isinstance(value, tuple) else value
+            self._node.declare_parameter(name, value, descriptor_of(setting), ignore_override=True)
+
+    def _value(self, name: str) -> Any:
+        value = self._node.get_parameter(name).value
+        return list(value) if isinstance(value, (array.array, tuple)) else value
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            setting = self._settings.get(parameter.name)
+            if setting is None:
+                continue
+            reason = self._why_fixed(parameter.name)
+            if reason is not None:
+                return SetParametersResult(successful=False, reason=f"'{parameter.name}' {reason}")
+            value = list(parameter.value) if isinstance(parameter.value, array.array) else parameter.value
+            try:
+                check_value(parameter.name, setting.hint, value, setting.metadata)
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _changed(self, parameters: list[Parameter]) -> None:
+        if any(parameter.name in self._settings for parameter in parameters):
+            self._on_change()
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn dotted names into nested mappings."""
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        *groups, last = name.split(".")
+        here = nested
+        for group in groups:
+            here = here.setdefault(group, {})
+        here[last] = value
+    return nested
