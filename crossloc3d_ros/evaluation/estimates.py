@@ -1,0 +1,349 @@
+"""Estimates on disk: written while they are made, read back to be scored, so that figures can be checked later.
+
+One CSV row a scan. Lists inside a row (the candidates, best first) are separated by spaces; unknown numbers are empty.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.types import BoolArray, Estimate, FixStatus, Float64Array, Int64Array
+
+_COVARIANCE_COLUMNS = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
+_TIMING_COLUMNS = ("prepare_ms", "encode_ms", "search_ms", "latency_ms")
+_CANDIDATE_COLUMNS = (
+    "candidate_ids",
+    "candidate_distances",
+    "candidate_probabilities",
+    "candidate_eastings_m",
+    "candidate_northings_m",
+)
+_ESTIMATE_COLUMNS = (
+    "stamp_ns",
+    "status",
+    "latitude_deg",
+    "longitude_deg",
+    "altitude_m",
+    "easting_m",
+    "northing_m",
+    "height_m",
+    *_COVARIANCE_COLUMNS,
+    "points_received",
+    "points_in_patch",
+    *_TIMING_COLUMNS,
+    *_CANDIDATE_COLUMNS,
+    "reason",
+)
+_TRUTH_COLUMNS = ("truth_latitude_deg", "truth_longitude_deg", "truth_easting_m", "truth_northing_m", "error_m")
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateTable:
+    """The estimates of a drive as columns over S scans, with up to K candidates each."""
+
+    stamp_ns: Int64Array
+    """(S,)"""
+    has_fix: BoolArray
+    """(S,)"""
+    geographic: Float64Array
+    """(S, 3) latitude and longitude in degrees, ellipsoidal height in metres; NaN where unknown."""
+    grid: Float64Array
+    """(S, 3) easting, northing, height, metres, the map's grid; NaN where there was no candidate."""
+    covariance: Float64Array
+    """(S, 3, 3) ENU, square metres."""
+    timings_ms: Float64Array
+    """(S, 4) preparing, encoding, searching, and from scan to estimate altogether; NaN where not measured."""
+    points: Int64Array
+    """(S, 2) points received and points used; -1 where not known."""
+    candidate_ids: Int64Array
+    """(S, K) rows of the map's submap table, -1 where there are fewer."""
+    candidate_distances: Float64Array
+    """(S, K) between descriptors."""
+    candidate_probabilities: Float64Array
+    """(S, K)"""
+    candidate_grid: Float64Array
+    """(S, K, 2) easting and northing, metres; NaN where there are fewer."""
+    truth_grid: Float64Array
+    """(S, 2) easting and northing, metres; NaN where unknown."""
+    reasons: tuple[str, ...]
+    """(S,)"""
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def error_m(self) -> Float64Array:
+        """Horizontal distance (S,) from the estimate to the truth, NaN where either is unknown."""
+        return np.asarray(np.hypot(*(self.grid[:, :2] - self.truth_grid).T))
+
+
+class EstimateWriter:
+    """Write estimates as they come; what was written stays readable if the run is cut short."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> Self:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # Line by line: after Ctrl-C the file ends with a whole row.
+            self._file = self.path.open("w", encoding="utf-8", newline="", buffering=1)
+            self._writer = csv.writer(self._file, lineterminator="\n")
+            self._writer.writerow(_ESTIMATE_COLUMNS)
+        except OSError as error:
+            raise CrossLocError(f"cannot write {self.path}: {error}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def write(self, estimate: Estimate, latency_ms: float | None = None) -> None:
+        """Append one estimate; `latency_ms` defaults to the sum of its timings."""
+        candidates = estimate.candidates
+        covariance = estimate.covariance[np.triu_indices(3)]
+        timings = estimate.timings
+        parts = (timings.prepare_ms, timings.encode_ms, timings.search_ms)
+        measured = parts if timings.total_ms > 0 else (math.nan,) * 3
+        latency = timings.total_ms if latency_ms is None else latency_ms
+        row: list[str] = [
+            str(estimate.stamp_ns),
+            estimate.status.value,
+            _number(estimate.latitude_deg, 9),
+            _number(estimate.longitude_deg, 9),
+            _number(estimate.altitude_m, 3),
+            *(_number(value, 3) for value in estimate.grid),
+            *(_number(value, 3) for value in covariance),
+            str(estimate.counts.received),
+            str(estimate.counts.in_patch),
+            *(_number(value, 3) for value in measured),
+            _number(latency, 3),
+            " ".join(str(int(i)) for i in candidates.submap_ids),
+            " ".join(f"{value:.6g}" for value in candidates.descriptor_distances),
+            " ".join(f"{value:.6g}" for value in candidates.probabilities),
+            " ".join(f"{value:.2f}" for value in candidates.grid[:, 0]),
+            " ".join(f"{value:.2f}" for value in candidates.grid[:, 1]),
+            estimate.reason,
+        ]
+        try:
+            self._writer.writerow(row)
+        except OSError as error:
+            raise CrossLocError(f"cannot write {self.path}: {error}") from error
+
+
+def read_estimates(path: Path) -> EstimateTable:
+    """Read a file of estimates, with or without truth; CrossLocError where it is none."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise CrossLocError(f"cannot read {path}: {error}") from error
+    try:
+        return _table(rows)
+    except (KeyError, ValueError, TypeError) as error:
+        raise CrossLocError(f"{path} is not a file of estimates: {error!r}") from error
+
+
+def add_truth(path: Path, truth_grid: Float64Array, frame: MapFrame) -> EstimateTable:
+    """Add the columns of truth and error to a file of estimates and return its table.
+
+    `truth_grid` (S, 2 or 3) easting and northing of each row, NaN where unknown. The file is replaced as a whole.
+    """
+    table = read_estimates(path)
+    if len(truth_grid) != len(table):
+        raise CrossLocError(f"truth for {len(truth_grid)} scans does not fit the {len(table)} estimates of {path}")
+    places = np.column_stack([truth_grid[:, :2], np.zeros(len(truth_grid))])
+    known = np.isfinite(places).all(axis=1)
+    latitude, longitude = np.full(len(table), np.nan), np.full(len(table), np.nan)
+    if known.any():
+        latitude[known], longitude[known], _ = frame.to_geographic(places[known])
+    errors = np.hypot(*(table.grid[:, :2] - truth_grid[:, :2]).T)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*_ESTIMATE_COLUMNS, *_TRUTH_COLUMNS], lineterminator="\n")
+    writer.writeheader()
+    for i, row in enumerate(rows):
+        values = (
+            _number(latitude[i], 9),
+            _number(longitude[i], 9),
+            _number(truth_grid[i, 0], 3),
+            _number(truth_grid[i, 1], 3),
+            _number(errors[i], 3),
+        )
+        writer.writerow({**row, **dict(zip(_TRUTH_COLUMNS, values, strict=True))})
+    write_atomically(path, text.getvalue())
+    return read_estimates(path)
+
+
+def write_geojson(path: Path, table: EstimateTable, frame: MapFrame, candidates: int = 5) -> None:
+    """Write truth, fixes and the first `candidates` of each scan as GeoJSON (RFC 7946: WGS84, longitude first)."""
+    features: list[dict[str, Any]] = []
+    truth = _geographic(frame, table.truth_grid)
+    if np.isfinite(truth).any():
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": _track(truth),
+                "properties": {"kind": "truth"},
+            }
+        )
+    errors = table.error_m
+    for i in range(len(table)):
+        place = table.geographic[i]
+        features.append(
+            {
+                "type": "Feature",
+                # RFC 7946 says null for a feature without a place.
+                "geometry": {"type": "Point", "coordinates": _position(place)}
+                if np.isfinite(place[:2]).all()
+                else None,
+                "properties": {
+                    "kind": "fix" if table.has_fix[i] else "no fix",
+                    "scan": i,
+                    "stamp_ns": str(table.stamp_ns[i]),  # as text: nanoseconds do not fit JSON's double
+                    "error_m": _json_number(errors[i], 1),
+                    "std_east_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 0, 0])), 1),
+                    "std_north_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 1, 1])), 1),
+                    "reason": table.reasons[i],
+                },
+            }
+        )
+        found = table.candidate_grid[i, :candidates]
+        found = found[np.isfinite(found).all(axis=1)]
+        if len(found):
+            features.append(
+                {
+                    "type": "Feature",
+                    "geometry": {
+                        "type": "MultiPoint",
+                        "coordinates": [_position(p) for p in _geographic(frame, found)],
+                    },
+                    "properties": {
+                        "kind": "candidates",
+                        "scan": i,
+                        "submaps": [int(j) for j in table.candidate_ids[i, : len(found)]],
+                        "descriptor_distances": [
+                            _json_number(value, 4) for value in table.candidate_distances[i, : len(found)]
+                        ],
+                        "probabilities": [
+                            _json_number(value, 4) for value in table.candidate_probabilities[i, : len(found)]
+                        ],
+                    },
+                }
+            )
+    write_atomically(path, json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False))
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that it is there as a whole or not at all; CrossLocError where it cannot be."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise CrossLocError(f"cannot write {path}: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _table(rows: Sequence[dict[str, str]]) -> EstimateTable:
+    count = len(rows)
+    width = max((len(row["candidate_ids"].split()) for row in rows), default=0)
+    ids = np.full((count, width), -1, dtype=np.int64)
+    lists = {name: np.full((count, width), np.nan) for name in _CANDIDATE_COLUMNS[1:]}
+    for i, row in enumerate(rows):
+        found = row["candidate_ids"].split()
+        ids[i, : len(found)] = [int(j) for j in found]
+        for name, values in lists.items():
+            values[i, : len(found)] = [float(value) for value in row[name].split()]
+    covariance = np.full((count, 3, 3), np.nan)
+    upper = np.triu_indices(3)
+    covariance[:, upper[0], upper[1]] = covariance[:, upper[1], upper[0]] = _columns(rows, _COVARIANCE_COLUMNS)
+    return EstimateTable(
+        stamp_ns=np.array([int(row["stamp_ns"]) for row in rows], dtype=np.int64),
+        has_fix=np.array([FixStatus(row["status"]) is FixStatus.FIX for row in rows], dtype=np.bool_),
+        geographic=_columns(rows, ("latitude_deg", "longitude_deg", "altitude_m")),
+        grid=_columns(rows, ("easting_m", "northing_m", "height_m")),
+        covariance=covariance,
+        timings_ms=_columns(rows, _TIMING_COLUMNS),
+        points=np.array(
+            [[int(row["points_received"]), int(row["points_in_patch"])] for row in rows], dtype=np.int64
+        ).reshape(count, 2),
+        candidate_ids=ids,
+        candidate_distances=lists["candidate_distances"],
+        candidate_probabilities=lists["candidate_probabilities"],
+        candidate_grid=np.stack([lists["candidate_eastings_m"], lists["candidate_northings_m"]], axis=-1),
+        truth_grid=_columns(rows, ("truth_easting_m", "truth_northing_m")),
+        reasons=tuple(row["reason"] for row in rows),
+    )
+
+
+def _columns(rows: Sequence[dict[str, str]], names: Sequence[str]) -> Float64Array:
+    values = [[float(row.get(name) or "nan") for name in names] for row in rows]
+    return np.array(values, dtype=np.float64).reshape(len(rows), len(names))
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def _json_number(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+def _geographic(frame: MapFrame, grid: Float64Array) -> Float64Array:
+    """Return (n, 2) latitude and longitude of grid points (n, 2), NaN where these are."""
+    result = np.full((len(grid), 2), np.nan)
+    known = np.isfinite(grid).all(axis=1)
+    if known.any():
+        latitude, longitude, _ = frame.to_geographic(np.column_stack([grid[known], np.zeros(known.sum())]))
+        result[known] = np.column_stack([latitude, longitude])
+    return result
+
+
+def _position(place: Float64Array) -> list[float]:
+    position = [round(float(place[1]), 8), round(float(place[0]), 8)]
+    if len(place) > 2 and math.isfinite(place[2]):
+        position.append(round(float(place[2]), 2))
+    return position
+
+
+def _point(place: Float64Array) -> dict[str, Any] | None:
+    """Return the geometry of a place (2 or 3); null, as RFC 7946 says, where it is not known."""
+    return {"type": "Point", "coordinates": _position(place)} if np.isfinite(place[:2]).all() else None
+
+
+def _track(truth: Float64Array) -> dict[str, Any]:
+    """Return the geometry of a track (n, 2): a line for each stretch without gaps, points for what stands alone."""
+    known: BoolArray = np.isfinite(truth).all(axis=1)
+    pieces = np.split(np.arange(len(truth)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
+    stretches = [[_position(truth[i]) for i in piece] for piece in pieces if known[piece[0]]]
+    lines = [stretch for stretch in stretches if len(stretch) > 1]
+    alone = [stretch[0] for stretch in stretches if len(stretch) == 1]
+    if lines and not alone:
+        if len(lines) == 1:
+            return {"type": "LineString", "coordinates": lines[0]}
+        return {"type": "MultiLineString", "coordinates": lines}
+    if alone and not lines:
+        return {"type": "MultiPoint", "coordinates": alone}
+    return {
+        "type": "GeometryCollection",
+        "geometries": [
+            {"type": "MultiLineString", "coordinates": lines},
+            {"type": "MultiPoint", "coordinates": alone},
+        ],
+    }
