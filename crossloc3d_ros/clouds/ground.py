@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -15,56 +17,94 @@ from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 # --- the ground around a robot ------------------------------------------------------------------------------------
 
 _CELL_M = 2.0
-_REACH_M = 100.0
-_STEEPEST = 0.30  # a rise faster than this is a wall, a car or a kerb, never the road
+_STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, never the road
 _STEP_M = 0.25  # and so is a step higher than this
-_BENDING = 0.12  # slope by which the ground may leave the fitted plane, a metre a metre of distance
-_LEVELS = 3  # grids of 8, 4 and 2 m
+_CONE_M = 1.0  # what lies deeper than the steepest road would lead, and this much more, is a reflection
+_LEVELS = 3  # the membrane is stretched over cells of 8, 4 and 2 m
 _SWEEPS = 12
 
 
-def scan_heights(points_base: Float32Array, sensor_height_m: float) -> Float32Array:
+def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: float = 72.0) -> Float32Array:
     """Return the heights (N,) float32 of a scan's points above the ground below them, metres.
 
-    Points (N, 3): base frame, z up, the base standing on the ground near z = 0, the sensor `sensor_height_m` above it.
-    NaN points have NaN heights.
+    Points (N, 3): base frame, z up, the base standing on the ground at about z = 0, the sensor `sensor_height_m`
+    above it. The ground is modelled out to `reach_m` on either side and carried on beyond. NaN points get NaN.
 
     The ground is a plane through what looks like ground, plus a membrane that follows the rings where they touch it
     and comes back to the plane where they do not. What looks like ground: the lowest point of a cell, no higher above
-    any other cell than the steepest road would take it. Points bound the ground from above even where they are not
-    on it, which is how walls and car roofs are kept out. With no usable point the ground is the plane z = 0.
+    any other cell than the steepest road would lead. Every point, and every ray on its way to one, bounds the ground
+    from above; that keeps walls and car roofs out. With no usable point the ground is the plane z = 0.
     """
     check_points(points_base, "points_base")
-    if not np.isfinite(sensor_height_m):
-        raise CloudError(f"sensor_height_m must be finite, got {sensor_height_m}")
+    if not (math.isfinite(sensor_height_m) and math.isfinite(reach_m) and reach_m > 0):
+        raise CloudError(f"sensor_height_m and reach_m must be finite, got {sensor_height_m} and {reach_m}")
     points = np.ascontiguousarray(points_base, dtype=np.float32)
-    cells = 2 * int(_REACH_M / _CELL_M)
-    lowest, where, support = _lowest_of_cells(points, cells, _CELL_M)
-    plane, ground = _fit_ground(lowest, where, support, _CELL_M, float(sensor_height_m))
-    heights: Float32Array = _heights_above(points, plane, ground, _CELL_M)
+    step = 1 << (_LEVELS - 1)
+    cells = 2 * step * math.ceil(reach_m / _CELL_M / step)  # every level halves it evenly
+    heights: Float32Array = _heights_above_ground(points, np.float32(sensor_height_m), cells)
     return heights
 
 
 @njit(cache=True, nogil=True)
-def _lowest_of_cells(points: Float32Array, cells: int, cell: float):  # type: ignore[no-untyped-def]
-    """Return each cell's lowest z (infinite where empty), where it lies (x, y), and how many points share its height.
+def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int) -> Float32Array:
+    """Run the steps: cells, candidates, plane, membrane, heights."""
+    lowest, where, share = _lowest_of_cells(points, cells)
+    bound = _steepest_bound(lowest)
+    _bound_by_rays(bound, lowest, where, sensor_height)
+    weight = np.zeros((cells, cells), np.float32)
+    for row in range(cells):
+        for column in range(cells):
+            if lowest[row, column] <= bound[row, column] + np.float32(_STEP_M):
+                weight[row, column] = share[row, column]
+    plane = _fit_plane(where, lowest, weight)
 
-    A point far below what the steepest ground through the base allows is a reflection and does not count.
+    # From here on everything is measured from the plane.
+    target = np.zeros((cells, cells), np.float32)
+    ceiling = np.full((cells, cells), np.inf, np.float32)
+    half = cells * _CELL_M / 2
+    for row in range(cells):
+        for column in range(cells):
+            x, y = where[row, column, 0], where[row, column, 1]
+            if np.isfinite(lowest[row, column]):
+                target[row, column] = lowest[row, column] - (plane[0] * x + plane[1] * y + plane[2])
+            x, y = (column + 0.5) * _CELL_M - half, (row + 0.5) * _CELL_M - half
+            ceiling[row, column] = bound[row, column] + 0.1 - (plane[0] * x + plane[1] * y + plane[2])
+    ground = np.zeros((cells, cells), np.float32)
+    robust = weight.copy()
+    for _ in range(3):
+        _stretch(ground, target, robust, ceiling)
+        for row in range(cells):
+            for column in range(cells):
+                if weight[row, column] > 0:
+                    above = (target[row, column] - ground[row, column]) / np.float32(0.2)
+                    robust[row, column] = weight[row, column] / (np.float32(1.0) + above * above)
+    _stretch(ground, target, robust, ceiling)
+    return _heights_above(points, plane, ground)
+
+
+@njit(cache=True, nogil=True)
+def _lowest_of_cells(points: Float32Array, cells: int):  # type: ignore[no-untyped-def]
+    """Return each cell's lowest z (infinite where there is none to trust), its x and y, and how flat the cell is.
+
+    Flat is the share of the points up to 2 m above the lowest that lie within 0.3 m of it: 1 on a road, little where
+    a wall stands. A lowest point without a second one near it, or far below all cells around, is a reflection.
     """
-    half = cells * cell / 2
+    inverse = np.float32(1.0 / _CELL_M)
+    half = np.float32(cells * _CELL_M / 2)
     lowest = np.full((cells, cells), np.inf, np.float32)
     where = np.zeros((cells, cells, 2), np.float32)
-    support = np.zeros((cells, cells), np.int32)
+    low = np.zeros((cells, cells), np.int32)
+    near = np.zeros((cells, cells), np.int32)
     cell_of = np.empty(points.shape[0], np.int32)
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         cell_of[i] = -1
         if not (abs(x) < half and abs(y) < half):
             continue
-        reach = np.sqrt(x * x + y * y) * np.float32(_STEEPEST) + np.float32(1.0)
-        if not (abs(z) <= reach):
+        allowed = np.sqrt(x * x + y * y) * np.float32(_STEEPEST) + np.float32(_CONE_M)
+        if not (abs(z) <= allowed):
             continue
-        row, column = int((y + half) / cell), int((x + half) / cell)
+        row, column = min(int((y + half) * inverse), cells - 1), min(int((x + half) * inverse), cells - 1)
         cell_of[i] = row * cells + column
         if z < lowest[row, column]:
             lowest[row, column] = z
@@ -73,22 +113,46 @@ def _lowest_of_cells(points: Float32Array, cells: int, cell: float):  # type: ig
     for i in range(points.shape[0]):
         if cell_of[i] >= 0:
             row, column = cell_of[i] // cells, cell_of[i] % cells
-            if points[i, 2] < lowest[row, column] + 0.3:
-                support[row, column] += 1
-    return lowest, where, support
+            above = points[i, 2] - lowest[row, column]
+            if above < np.float32(2.0):
+                near[row, column] += 1
+                if above < np.float32(0.3):
+                    low[row, column] += 1
+    share = np.zeros((cells, cells), np.float32)
+    trusted = lowest.copy()
+    for row in range(cells):
+        for column in range(cells):
+            if low[row, column] < 2 or _is_pit_of_scan(lowest, row, column):
+                trusted[row, column] = np.inf
+            else:
+                share[row, column] = low[row, column] / near[row, column]
+    return trusted, where, share
 
 
 @njit(cache=True, nogil=True)
-def _envelope(lowest: Float32Array, cell: float, steepest: float, sensor_ground: float) -> Float32Array:
-    """Return the highest ground that the steepest slope allows over all cells (two chamfer passes) and the base."""
+def _is_pit_of_scan(lowest: Float32Array, row: int, column: int) -> bool:
+    """Return whether at least three cells around are occupied and all lie far above this one."""
+    n = lowest.shape[0]
+    others = 0
+    for r in range(max(0, row - 1), min(n, row + 2)):
+        for c in range(max(0, column - 1), min(n, column + 2)):
+            if (r != row or c != column) and lowest[r, c] < np.inf:
+                others += 1
+                if lowest[r, c] - lowest[row, column] < np.float32(0.4 + _STEEPEST * _CELL_M):
+                    return False
+    return others >= 3
+
+
+@njit(cache=True, nogil=True)
+def _steepest_bound(lowest: Float32Array) -> Float32Array:
+    """Return the highest ground that the steepest slope allows above all cells and the base (two chamfer passes)."""
     n = lowest.shape[0]
     bound = lowest.copy()
-    middle = n // 2
-    for row in range(middle - 1, middle + 1):
-        for column in range(middle - 1, middle + 1):
-            bound[row, column] = min(bound[row, column], sensor_ground + steepest * cell)
-    straight = np.float32(steepest * cell)
-    diagonal = np.float32(steepest * cell * 1.4142)
+    straight = np.float32(_STEEPEST * _CELL_M)
+    diagonal = np.float32(_STEEPEST * _CELL_M * 1.4142)
+    for row in range(n // 2 - 1, n // 2 + 1):
+        for column in range(n // 2 - 1, n // 2 + 1):
+            bound[row, column] = min(bound[row, column], straight)
     for row in range(n):
         for column in range(n):
             b = bound[row, column]
@@ -117,132 +181,132 @@ def _envelope(lowest: Float32Array, cell: float, steepest: float, sensor_ground:
 
 
 @njit(cache=True, nogil=True)
-def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, plane: Float64Array) -> Float64Array:
-    """Return the weighted plane z = a x + b y + c through the cells, held by the base standing at z = 0.
-
-    Cells far from the last plane count less (Cauchy), those above it least: what stands on the ground is above it.
-    """
+def _bound_by_rays(bound: Float32Array, lowest: Float32Array, where: Float32Array, sensor_height: float) -> None:
+    """Lower the bound to the ray from the sensor to each cell's lowest point: light does not pass through ground."""
     n = lowest.shape[0]
-    A = np.zeros((3, 3))
-    r = np.zeros(3)
-    A[0, 0] = A[1, 1] = 40.0  # flat unless the rings say otherwise
-    A[2, 2] = 20.0
-    for row in range(n):
-        for column in range(n):
-            w = weight[row, column]
-            if w <= 0:
-                continue
-            x, y, z = where[row, column, 0], where[row, column, 1], lowest[row, column]
-            residual = z - (plane[0] * x + plane[1] * y + plane[2])
-            scale = 0.15 if residual > 0 else 0.4
-            distance2 = x * x + y * y
-            w = w / (1.0 + (residual / scale) ** 2) / (1.0 + distance2 / 400.0)
-            A[0, 0] += w * x * x
-            A[0, 1] += w * x * y
-            A[0, 2] += w * x
-            A[1, 1] += w * y * y
-            A[1, 2] += w * y
-            A[2, 2] += w
-            r[0] += w * x * z
-            r[1] += w * y * z
-            r[2] += w * z
-    A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
-    solution: Float64Array = np.linalg.solve(A, r)
-    return solution
-
-
-@njit(cache=True, nogil=True)
-def _fit_ground(  # type: ignore[no-untyped-def]
-    lowest: Float32Array, where: Float32Array, support: Float32Array, cell: float, sensor_height: float
-):
-    """Return the plane (a, b, c) and the ground's height above it on the grid of cells."""
-    n = lowest.shape[0]
-    bound = _envelope(lowest, cell, _STEEPEST, 0.0)
-    weight = np.zeros((n, n), np.float32)
-    for row in range(n):
-        for column in range(n):
-            if lowest[row, column] <= bound[row, column] + _STEP_M:
-                weight[row, column] = 1.0 if support[row, column] > 1 else 0.3
-    plane = np.zeros(3)
-    for _ in range(6):
-        plane = _fit_plane(where, lowest, weight, plane)
-
-    residual = np.zeros((n, n), np.float32)
-    ceiling = np.full((n, n), np.inf, np.float32)
+    half = np.float32(n * _CELL_M / 2)
+    inverse = np.float32(1.0 / _CELL_M)
     for row in range(n):
         for column in range(n):
             z = lowest[row, column]
-            if not np.isfinite(z):
+            if not z < np.inf:
                 continue
             x, y = where[row, column, 0], where[row, column, 1]
-            r = z - (plane[0] * x + plane[1] * y + plane[2])
-            residual[row, column] = r
-            ceiling[row, column] = r + 0.1
-            distance = np.sqrt(x * x + y * y)
-            if abs(r) > 0.2 + _BENDING * distance:
-                weight[row, column] = 0.0
-    ground = np.zeros((n, n), np.float32)
-    for _ in range(3):
-        _stretch(ground, residual, weight, ceiling)
-        for row in range(n):
-            for column in range(n):
-                if weight[row, column] > 0:
-                    above = residual[row, column] - ground[row, column]
-                    weight[row, column] = 1.0 / (1.0 + (above / 0.15) ** 2)
-    _stretch(ground, residual, weight, ceiling)
-    return plane, ground
+            steps = int(np.sqrt(x * x + y * y) * inverse)
+            if steps < 2:
+                continue
+            share = np.float32(1.0) / np.float32(steps)
+            u, v = half * inverse, half * inverse
+            height = np.float32(sensor_height)
+            du, dv, dz = x * inverse * share, y * inverse * share, (z - height) * share
+            for _ in range(steps - 1):
+                u += du
+                v += dv
+                height += dz
+                r, c = int(v), int(u)
+                bound[r, c] = min(bound[r, c], height)
 
 
-@njit(cache=True, nogil=True, fastmath=False)
+@njit(cache=True, nogil=True)
+def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array) -> Float64Array:
+    """Return the plane z = a x + b y + c through the cells' lowest points, held by the base that stands at z = 0.
+
+    Cells off the last plane count less (Cauchy), those above it least: what stands on the ground is above it. Cells
+    near the robot count more, there the rings are dense.
+    """
+    n = lowest.shape[0]
+    count = 0
+    x, y, z, w = np.empty(n * n), np.empty(n * n), np.empty(n * n), np.empty(n * n)
+    for row in range(n):
+        for column in range(n):
+            if weight[row, column] > 0:
+                x[count], y[count] = where[row, column, 0], where[row, column, 1]
+                z[count] = lowest[row, column]
+                w[count] = weight[row, column] / (1.0 + (x[count] ** 2 + y[count] ** 2) / 400.0)
+                count += 1
+    plane = np.zeros(3)
+    for _ in range(8):
+        A = np.zeros((3, 3))
+        r = np.zeros(3)
+        A[0, 0] = A[1, 1] = 40.0  # flat unless the rings say otherwise
+        A[2, 2] = 20.0
+        for i in range(count):
+            off = z[i] - (plane[0] * x[i] + plane[1] * y[i] + plane[2])
+            scaled = off / (0.15 if off > 0 else 0.4)
+            wi = w[i] / (1.0 + scaled * scaled)
+            A[0, 0] += wi * x[i] * x[i]
+            A[0, 1] += wi * x[i] * y[i]
+            A[0, 2] += wi * x[i]
+            A[1, 1] += wi * y[i] * y[i]
+            A[1, 2] += wi * y[i]
+            A[2, 2] += wi
+            r[0] += wi * x[i] * z[i]
+            r[1] += wi * y[i] * z[i]
+            r[2] += wi * z[i]
+        A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
+        plane = np.linalg.solve(A, r)
+    return plane
+
+
+@njit(cache=True, nogil=True)
 def _stretch(ground: Float32Array, target: Float32Array, weight: Float32Array, ceiling: Float32Array) -> None:
     """Relax `ground` between the weighted targets, under the ceiling, with a faint pull to 0; coarse to fine."""
     n = ground.shape[0]
     for level in range(_LEVELS - 1, -1, -1):
         step = 1 << level
         m = n // step
-        w = np.zeros((m, m), np.float32)
-        t = np.zeros((m, m), np.float32)
-        g = np.zeros((m, m), np.float32)
+        held = np.zeros((m, m), np.float32)
+        inverse = np.zeros((m, m), np.float32)
         top = np.full((m, m), np.inf, np.float32)
-        for row in range(m * step):
-            for column in range(m * step):
+        g = np.zeros((m + 2, m + 2), np.float32)  # with a rim that repeats the outermost cells: free edges
+        for row in range(n):
+            for column in range(n):
                 R, C = row // step, column // step
-                w[R, C] += weight[row, column]
-                t[R, C] += weight[row, column] * target[row, column]
-                g[R, C] += ground[row, column] / (step * step)
+                inverse[R, C] += weight[row, column]
+                held[R, C] += weight[row, column] * target[row, column]
                 top[R, C] = min(top[R, C], ceiling[row, column])
-        pull = np.float32(0.002 * step * step)
+                g[R + 1, C + 1] += ground[row, column]
+        pull = np.float32(4.0 + 0.002 * step * step)
+        mean = np.float32(1.0 / (step * step))
+        for R in range(m):
+            for C in range(m):
+                inverse[R, C] = np.float32(1.0) / (inverse[R, C] + pull)
+                g[R + 1, C + 1] *= mean
         for _ in range(_SWEEPS):
-            for row in range(m):
-                for column in range(m):
-                    up = g[row - 1, column] if row > 0 else g[row, column]
-                    down = g[row + 1, column] if row < m - 1 else g[row, column]
-                    left = g[row, column - 1] if column > 0 else g[row, column]
-                    right = g[row, column + 1] if column < m - 1 else g[row, column]
-                    value = (t[row, column] + up + down + left + right) / (w[row, column] + 4.0 + pull)
-                    g[row, column] = min(value, top[row, column])
-        for row in range(m * step):
-            for column in range(m * step):
-                ground[row, column] = g[row // step, column // step]
+            for k in range(1, m + 1):
+                g[0, k], g[m + 1, k], g[k, 0], g[k, m + 1] = g[1, k], g[m, k], g[k, 1], g[k, m]
+            for R in range(1, m + 1):
+                left = g[R, 0]
+                for C in range(1, m + 1):
+                    others = held[R - 1, C - 1] + g[R - 1, C] + g[R + 1, C] + g[R, C + 1]
+                    left = min((others + left) * inverse[R - 1, C - 1], top[R - 1, C - 1])
+                    g[R, C] = left
+        for row in range(n):
+            for column in range(n):
+                ground[row, column] = g[row // step + 1, column // step + 1]
 
 
 @njit(cache=True, nogil=True)
-def _heights_above(points: Float32Array, plane: Float64Array, ground: Float32Array, cell: float) -> Float32Array:
+def _heights_above(points: Float32Array, plane: Float64Array, ground: Float32Array) -> Float32Array:
+    """Return z minus the plane minus the bilinear ground (N,); beyond the grid its outermost value holds."""
     n = ground.shape[0]
-    half = n * cell / 2
+    inverse = np.float32(1.0 / _CELL_M)
+    half = np.float32(n * _CELL_M / 2)
+    last = np.float32(n - 1.001)
+    a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     heights = np.empty(points.shape[0], np.float32)
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if not (np.isfinite(x) and np.isfinite(y)):
             heights[i] = np.nan
             continue
-        u = min(max((x + half) / cell - 0.5, 0.0), n - 1.001)
-        v = min(max((y + half) / cell - 0.5, 0.0), n - 1.001)
+        u = min(max((x + half) * inverse - np.float32(0.5), np.float32(0.0)), last)
+        v = min(max((y + half) * inverse - np.float32(0.5), np.float32(0.0)), last)
         column, row = int(u), int(v)
-        fu, fv = u - column, v - row
-        south = ground[row, column] * (1 - fu) + ground[row, column + 1] * fu
-        north = ground[row + 1, column] * (1 - fu) + ground[row + 1, column + 1] * fu
-        heights[i] = z - (plane[0] * x + plane[1] * y + plane[2]) - (south * (1 - fv) + north * fv)
+        fu, fv = u - np.float32(column), v - np.float32(row)
+        south = ground[row, column] + (ground[row, column + 1] - ground[row, column]) * fu
+        north = ground[row + 1, column] + (ground[row + 1, column + 1] - ground[row + 1, column]) * fu
+        heights[i] = z - (a * x + b * y + c) - (south + (north - south) * fv)
     return heights
 
 
