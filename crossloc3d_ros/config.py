@@ -115,7 +115,7 @@ class LocalizerNodeConfig(LocalizerConfig):
 
     map: str = option("", "folder of the aerial map, as build_map writes it")
     weights: str = option("", "weights file (safetensors); empty = the shipped weights")
-    device: str = option("cpu", "where the encoder runs: cpu or cuda")
+    device: Literal["cpu", "cuda"] = option("cpu", "where the encoder runs")
     autostart: bool = option(True, "configure and activate without being told by a lifecycle manager")
     global_frame_id: str = option("map", "name of the ENU frame at the map's origin")
     base_frame_id: str = option("base_link", "name of the frame whose position is given")

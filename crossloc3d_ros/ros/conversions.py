@@ -158,7 +158,7 @@ def _pose(enu: Float64Array) -> Pose:
 
 
 def _above(enu: Float64Array, height_m: float) -> Float64Array:
-    return enu + np.array([0.0, 0.0, height_m])
+    return np.asarray(enu + np.array([0.0, 0.0, height_m]))
 
 
 def _marker(header: Header, namespace: str, number: int, kind: int, position: Float64Array) -> Marker:

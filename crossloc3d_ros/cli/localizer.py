@@ -1,0 +1,62 @@
+"""`localizer`: the node that turns clouds into fixes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from crossloc3d_ros.cli import common
+from crossloc3d_ros.config import LocalizerNodeConfig, Setting, settings_of
+from crossloc3d_ros.errors import CrossLocError
+
+USAGE = """usage: localizer --ros-args -p map:=FOLDER [-p NAME:=VALUE ...] [--params-file FILE] [-r points:=TOPIC]
+
+Tell from LiDAR scans where on an aerial map the robot is.
+
+subscribes  points                           sensor_msgs/PointCloud2
+            imu                              sensor_msgs/Imu, where use_imu is set
+publishes   ~/fix                            sensor_msgs/NavSatFix, one for each scan that is worked on
+            ~/pose                           geometry_msgs/PoseWithCovarianceStamped, latched, only with a fix
+            ~/candidates                     geometry_msgs/PoseArray
+            ~/candidate_table                sensor_msgs/PointCloud2
+            ~/markers                        visualization_msgs/MarkerArray
+            ~/map_origin                     sensor_msgs/NavSatFix, latched: where the frame `map` has its origin
+            /diagnostics                     diagnostic_msgs/DiagnosticArray
+service     reinitialize_global_localization std_srvs/Empty
+
+parameters
+"""
+ROS_PACKAGES = "rclpy", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs", "diagnostic_msgs", "visualization_msgs"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node and return the exit code of the process."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    own = arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+    if "-h" in own or "--help" in own:
+        print(USAGE + "\n".join(_describe(setting) for setting in settings_of(LocalizerNodeConfig)))
+        return 0
+
+    def action() -> int:
+        try:
+            from crossloc3d_ros.ros.localizer_node import run_localizer
+        except ModuleNotFoundError as error:
+            if (error.name or "").split(".")[0] not in ROS_PACKAGES:
+                raise
+            raise CrossLocError(
+                f"ROS 2 was not found (no module '{error.name}'): source /opt/ros/jazzy/setup.bash, or "
+                "pip install ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
+            ) from error
+        return run_localizer(arguments)
+
+    return common.run(action)
+
+
+def _describe(setting: Setting) -> str:
+    default = list(setting.default) if isinstance(setting.default, tuple) else setting.default
+    limits = "" if setting.low is None or setting.high is None else f", {setting.low:g} to {setting.high:g}"
+    return f"  {setting.name:30} {setting.text} (default: {default!r}{limits})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,486 @@
+"""The localizer as a lifecycle node: clouds in, fixes out."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+    qos_profile_sensor_data,
+)
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import Imu, NavSatFix, PointCloud2
+from std_srvs.srv import Empty
+from visualization_msgs.msg import MarkerArray
+
+from crossloc3d_ros.config import LocalizerNodeConfig
+from crossloc3d_ros.encoder.checkpoint import load_encoder
+from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError
+from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
+from crossloc3d_ros.localization.gravity import GravityFilter
+from crossloc3d_ros.localization.localizer import Localizer, no_estimate
+from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.ros.conversions import (
+    candidate_table_message,
+    candidates_message,
+    fix_message,
+    markers_message,
+    origin_message,
+    pose_message,
+)
+from crossloc3d_ros.ros.diagnostics import Outcome, Statistics, diagnostic_message, judge_health, snapshot_values
+from crossloc3d_ros.ros.newest import NewestWorker
+from crossloc3d_ros.ros.parameters import ConfigParameters
+from crossloc3d_ros.ros.transforms import TransformSource
+from crossloc3d_ros.types import Estimate, FixStatus, Float64Array
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DIAGNOSTICS_PERIOD_S = 1.0
+REPEAT_REASON_S = 10.0
+SPIN_S = 0.1
+"""How long the executor waits at most before the process notices a signal."""
+EXIT_ERROR = 2
+
+SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.")
+"""Parameters that a running node takes up at once; the others need a new configuration of the node."""
+
+
+def load_localizer(config: LocalizerNodeConfig) -> Localizer:
+    """Load weights and map and bring them together; raises CrossLocError saying what is missing."""
+    if not config.map:
+        raise ConfigError("parameter 'map' is empty: give the folder of an aerial map, as build_map writes it")
+    encoder = load_encoder(Path(config.weights) if config.weights else None, device=config.device)
+    return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A cloud and when it came in."""
+
+    message: PointCloud2
+    received_s: float
+    """Monotonic clock."""
+
+
+class LocalizerNode(LifecycleNode):
+    """Subscribe to clouds, localize the newest, publish the fix and what led to it."""
+
+    def __init__(self, load: Callable[[LocalizerNodeConfig], Localizer] = load_localizer) -> None:
+        """Declare the parameters; `load` makes the localizer at configuration. Raises ConfigError."""
+        super().__init__("localizer", automatically_declare_parameters_from_overrides=True)
+        self._load = load
+        self._points_topic = self.resolve_topic_name("points")
+        self._configuration = ConfigParameters(
+            self,
+            LocalizerNodeConfig,
+            topics=(self._points_topic, self.resolve_topic_name("imu")),
+            why_fixed=self._why_fixed,
+            on_change=self._take_up_settings,
+        )
+        self._config = self._configuration.config
+        self._localizer: Localizer | None = None
+        self._transforms: TransformSource | None = None
+        self._gravity = GravityFilter(self._config.imu_time_constant_s)
+        self._worker = NewestWorker(self._process, "localize")
+        self._statistics = Statistics()
+        self._complaint = ""
+        self._last_status: FixStatus | None = None
+        self._outputs: dict[str, Any] = {}
+        self._inputs: list[Any] = []
+        self.failure = ""
+        """Why the node could not start by itself; empty as long as it can."""
+
+        # Not held up by a simulated clock that stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics_timer = self.create_timer(DIAGNOSTICS_PERIOD_S, self._publish_diagnostics, clock=steady)
+        self.create_service(Empty, "reinitialize_global_localization", self._reinitialize)
+        if self._config.autostart:
+            self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load weights and map and announce the outputs."""
+        return self._attempt(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Warm up, publish the map's origin and begin to listen."""
+        result = self._attempt(self._activate)
+        return super().on_activate(state) if result == TransitionCallbackReturn.SUCCESS else result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening and let the scan at work end."""
+        self._stop_listening()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of weights and map."""
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop for good."""
+        self._stop_listening()
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Fall back to unconfigured, from where a lifecycle manager can try again."""
+        self._stop_listening()
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _autostart(self) -> None:
+        self.destroy_timer(self._autostart_timer)
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                self.failure = self._complaint
+                return
+
+    def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        """Run a step of the lifecycle; what goes wrong is logged, where rclpy would swallow it."""
+        self._complaint = ""
+        try:
+            step()
+        except CrossLocError as error:
+            self._complaint = " ".join(str(error).split())
+        except InvalidQosOverridesError as error:
+            self._complaint = f"qos_overrides.{self._points_topic}: {error}"
+        except Exception as error:
+            self._complaint = f"{type(error).__name__}: {error}"
+            logging.getLogger(__name__).exception("the localizer could not start")
+        else:
+            return TransitionCallbackReturn.SUCCESS
+        self.get_logger().error(self._complaint)
+        self._stop_listening()
+        if not self._outputs:
+            self._release()
+        return TransitionCallbackReturn.FAILURE
+
+    def _configure(self) -> None:
+        self._config = config = self._configuration.config
+        started = time.monotonic()
+        if config.mounting_from_tf:
+            if not config.base_frame_id:
+                raise ConfigError("mounting_from_tf needs a base_frame_id")
+            self._transforms = TransformSource(self, config.base_frame_id)
+        self._gravity = GravityFilter(config.imu_time_constant_s)
+        self._localizer = localizer = self._load(config)
+        self._outputs = {
+            "fix": self.create_lifecycle_publisher(NavSatFix, "~/fix", 10),
+            "pose": self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),
+            "candidates": self.create_lifecycle_publisher(PoseArray, "~/candidates", 10),
+            "candidate_table": self.create_lifecycle_publisher(PointCloud2, "~/candidate_table", 10),
+            "markers": self.create_lifecycle_publisher(MarkerArray, "~/markers", 1),
+        }
+        # Not managed: who joins while the node is inactive shall learn of the origin too.
+        self._outputs["map_origin"] = self.create_publisher(NavSatFix, "~/map_origin", LATCHED)
+        stamp_ns = self.get_clock().now().nanoseconds
+        origin = origin_message(localizer.aerial_map.frame, stamp_ns, config.global_frame_id)
+        self._outputs["map_origin"].publish(origin)
+        self.get_logger().info(
+            f"map '{config.map}': {len(localizer.aerial_map.submaps.grid):,} submaps, "
+            f"origin {origin.latitude:.6f}, {origin.longitude:.6f}; "
+            f"weights {localizer.encoder.fingerprint[:12]}; loaded in {time.monotonic() - started:.1f} s"
+        )
+
+    def _activate(self) -> None:
+        started = time.monotonic()
+        localizer = self._localizer
+        if localizer is None:
+            raise ConfigError("the node is not configured")
+        # In the worker's own thread, because numerical libraries keep state for each thread.
+        self._worker.start(localizer.warm_up)
+        self._statistics.reset()
+        self._last_status = None
+        self._inputs = [
+            self.create_subscription(
+                PointCloud2,
+                "points",
+                self._receive,
+                qos_profile_sensor_data,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                event_callbacks=SubscriptionEventCallbacks(
+                    incompatible_qos=self._on_incompatible_qos, message_lost=self._on_message_lost
+                ),
+            )
+        ]
+        if self._config.use_imu:
+            options = QoSOverridingOptions.with_default_policies()
+            self._inputs.append(
+                self.create_subscription(
+                    Imu, "imu", self._receive_imu, qos_profile_sensor_data, qos_overriding_options=options
+                )
+            )
+        self.get_logger().info(f"warm after {time.monotonic() - started:.1f} s; listening on {self._points_topic}")
+
+    def _stop_listening(self) -> bool:
+        """Take no more clouds and wait for the worker; return whether it has ended."""
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs = []
+        ended = self._worker.stop()
+        if not ended:
+            self.get_logger().error("the scan at work does not end")
+        return ended
+
+    def _release(self) -> None:
+        for name, publisher in self._outputs.items():
+            if name == "map_origin":
+                self.destroy_publisher(publisher)
+            else:
+                self.destroy_lifecycle_publisher(publisher)
+        self._outputs = {}
+        if self._transforms is not None:
+            self._transforms.close()
+        self._transforms = None
+        self._localizer = None
+
+    # Parameters
+
+    def _why_fixed(self, name: str) -> str | None:
+        if name == "autostart":
+            return "is read once, at the start"
+        if self._localizer is None or name.startswith(SETTINGS_OF_LOCALIZE):
+            return None
+        return "is read when the node is configured: clean the node up first"
+
+    def _take_up_settings(self) -> None:
+        """Give the running localizer new settings; the scan at work ends with the old ones."""
+        if self._localizer is not None:
+            self._config = self._configuration.config
+            self._localizer = Localizer(self._localizer.aerial_map, self._localizer.encoder, self._config)
+
+    # Input
+
+    def _receive(self, message: PointCloud2) -> None:
+        self._statistics.received()
+        if self._worker.offer(Arrival(message, time.monotonic())):
+            self._statistics.dropped()
+
+    def _receive_imu(self, message: Imu) -> None:
+        force = message.linear_acceleration
+        acceleration = np.array([force.x, force.y, force.z])
+        stamp = message.header.stamp
+        if self._transforms is not None:
+            try:
+                acceleration = self._transforms.pose_on_base(message.header.frame_id)[:3, :3] @ acceleration
+            except CloudError as error:
+                self.get_logger().warning(f"IMU: {error}", throttle_duration_sec=REPEAT_REASON_S)
+                return
+        if not self._gravity.update(stamp.sec * 1_000_000_000 + stamp.nanosec, acceleration):
+            self.get_logger().warning(
+                f"IMU: acceleration {np.round(acceleration, 2).tolist()} m/s2 is no gravity; sample left out",
+                throttle_duration_sec=REPEAT_REASON_S,
+            )
+
+    def _reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
+        """Forget everything that earlier messages left behind."""
+        if self._worker.discard():
+            self._statistics.dropped()
+        self._gravity.reset()
+        self._last_status = None
+        self.get_logger().info("localizing anew")
+        return response
+
+    def _on_incompatible_qos(self, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        self._complaint = (
+            f"a publisher on {self._points_topic} offers an incompatible {policy}, so its clouds never arrive: "
+            f"set qos_overrides.{self._points_topic}.subscription.*"
+        )
+        self.get_logger().error(self._complaint)
+
+    def _on_message_lost(self, event: Any) -> None:
+        self._statistics.lost(int(event.total_count))
+
+    # One scan, in the worker's thread
+
+    def _process(self, arrival: Arrival) -> None:
+        outcome = self._localize(arrival.message)
+        try:
+            self._publish(outcome.estimate)
+        except Exception:
+            # The worker must outlive whatever happens; publishing fails when the node is being torn down.
+            logging.getLogger(__name__).exception("the estimate could not be published")
+        self._statistics.processed(outcome, 1e3 * (time.monotonic() - arrival.received_s))
+        self._tell(outcome)
+
+    def _localize(self, message: PointCloud2) -> Outcome:
+        """Return what comes of a message; every failure becomes an estimate without a fix, with its reason."""
+        localizer = self._localizer
+        stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        try:
+            if localizer is None:
+                raise CloudError("the node is being cleaned up")
+            scan = scan_from_pointcloud2(message)
+            T_base_lidar = None if self._transforms is None else self._transforms.pose_on_base(scan.frame_id)
+            gravity = self._gravity.up(stamp_ns) if self._config.use_imu else None
+            return Outcome(localizer.localize(scan, gravity, T_base_lidar), is_fault=False)
+        except CrossLocError as error:
+            return Outcome(no_estimate(stamp_ns, str(error)), is_fault=True)
+        except Exception as error:
+            logging.getLogger(__name__).exception("localizing failed")
+            return Outcome(no_estimate(stamp_ns, f"{type(error).__name__}: {error}"), is_fault=True)
+
+    def _publish(self, estimate: Estimate) -> None:
+        outputs, config, localizer = self._outputs, self._config, self._localizer
+        outputs["fix"].publish(fix_message(estimate, config.base_frame_id))
+        if estimate.status is FixStatus.FIX:
+            outputs["pose"].publish(pose_message(estimate, config.global_frame_id))
+        if localizer is None:
+            return
+        wanted = {name for name, publisher in outputs.items() if publisher.get_subscription_count() > 0}
+        if not wanted & {"candidates", "candidate_table", "markers"}:
+            return
+        frame, grid = localizer.aerial_map.frame, estimate.candidates.grid
+        enu: Float64Array = frame.to_enu(grid) if len(grid) else np.empty((0, 3))
+        if "candidates" in wanted:
+            outputs["candidates"].publish(candidates_message(estimate, enu, config.global_frame_id))
+        if "candidate_table" in wanted:
+            latitude, longitude, _ = frame.to_geographic(grid) if len(grid) else (np.empty(0), np.empty(0), None)
+            table = candidate_table_message(estimate, enu, latitude, longitude, config.global_frame_id)
+            outputs["candidate_table"].publish(table)
+        if "markers" in wanted:
+            outputs["markers"].publish(markers_message(estimate, enu, config.global_frame_id))
+
+    def _tell(self, outcome: Outcome) -> None:
+        """Log the first result, every change between fix and no fix, and now and then why there is no fix."""
+        estimate, log = outcome.estimate, self.get_logger()
+        changed = estimate.status is not self._last_status
+        self._last_status = estimate.status
+        if estimate.status is FixStatus.FIX:
+            if changed:
+                log.info(f"fix at {estimate.latitude_deg:.6f}, {estimate.longitude_deg:.6f}: {estimate.reason}")
+        elif outcome.is_fault:
+            log.error(estimate.reason, throttle_duration_sec=REPEAT_REASON_S)
+        else:
+            log.warning(f"no fix: {estimate.reason}", throttle_duration_sec=REPEAT_REASON_S)
+
+    # Diagnostics
+
+    def _publish_diagnostics(self) -> None:
+        snapshot = self._statistics.snapshot()
+        localizer, config = self._localizer, self._config
+        values = snapshot_values(snapshot)
+        values["map"] = config.map
+        if localizer is not None:
+            values["submaps"] = str(len(localizer.aerial_map.submaps.grid))
+            values["encoder"] = localizer.encoder.fingerprint
+        if self._inputs:
+            publishers = self.count_publishers(self._points_topic)
+            level, message = judge_health(snapshot, self._points_topic, publishers, self._complaint)
+        elif self._complaint:
+            level, message = DiagnosticStatus.ERROR, self._complaint
+        else:
+            level = DiagnosticStatus.OK
+            message = "inactive" if localizer is not None else "not configured"
+        if config.use_imu and self._inputs:
+            now_ns = self._now_ns(snapshot.last)
+            tilt = self._gravity.up(now_ns)
+            values["imu"] = "no recent sample" if tilt is None else f"up is {np.round(tilt, 3).tolist()} in base"
+        name = f"{self.get_fully_qualified_name().lstrip('/')}: localization"
+        stamp_ns = self.get_clock().now().nanoseconds
+        self._diagnostics.publish(diagnostic_message(name, stamp_ns, level, message, values))
+
+    def _now_ns(self, last: Outcome | None) -> int:
+        """Return the time on the sensors' clock, as far as a scan has told it."""
+        return self.get_clock().now().nanoseconds if last is None else last.estimate.stamp_ns
+
+    def close(self) -> bool:
+        """Let go of everything, whatever the state, before `destroy_node`; return whether the worker has ended."""
+        ended = self._stop_listening()
+        self._release()
+        return ended
+
+
+class _RosLogHandler(logging.Handler):
+    """Show what the libraries of this package log through the node's logger."""
+
+    def __init__(self, node: LocalizerNode) -> None:
+        super().__init__()
+        self._log = node.get_logger().get_child("library")
+        self.setFormatter(logging.Formatter("%(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # A call site of a ROS logger has one severity for good: one line each.
+        text = self.format(record)
+        if record.levelno >= logging.ERROR:
+            self._log.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._log.warning(text)
+        elif record.levelno >= logging.INFO:
+            self._log.info(text)
+        else:
+            self._log.debug(text)
+
+
+def run_localizer(arguments: Sequence[str]) -> int:
+    """Run the node until it is told to stop, and return the exit code.
+
+    0 after SIGINT or SIGTERM, as ROS 2 launch expects it; 2 where it could not start by itself, which the log
+    explains. Raises CrossLocError for arguments and parameters that are wrong.
+    """
+    # The handlers are ours, so that the worker ends and the node says good-bye while the context still lives.
+    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # the client library has no common base for malformed arguments
+        raise ConfigError(str(error)) from error
+    executor = SingleThreadedExecutor()
+    node: LocalizerNode | None = None
+    handler: logging.Handler | None = None
+    try:
+        surplus = remove_ros_args(["localizer", *arguments])[1:]
+        if surplus:
+            raise ConfigError(f"unknown argument '{surplus[0]}'; parameters follow --ros-args, as -p name:=value")
+        node = LocalizerNode()
+        handler = _RosLogHandler(node)
+        logging.getLogger("crossloc3d_ros").addHandler(handler)
+        logging.getLogger("crossloc3d_ros").propagate = False
+        executor.add_node(node)
+        while not node.failure:
+            executor.spin_once(timeout_sec=SPIN_S)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        # From here on a second signal would only tear what is being put away in order.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        ended = node is None or node.close()
+        if handler is not None:
+            logging.getLogger("crossloc3d_ros").removeHandler(handler)
+        executor.shutdown()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        if not ended:
+            # A thread that hangs in compiled code makes the interpreter crash at exit; everything else is put away.
+            os._exit(EXIT_ERROR)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
