@@ -47,16 +47,19 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
 
 @njit(cache=True, nogil=True)
 def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int) -> Float32Array:
-    """Run the steps: cells, candidates, plane, membrane, heights."""
-    lowest, where, share = _lowest_of_cells(points, cells)
-    bound = _steepest_bound(lowest)
-    _bound_by_rays(bound, lowest, where, sensor_height)
-    weight = np.zeros((cells, cells), np.float32)
-    for row in range(cells):
-        for column in range(cells):
-            if lowest[row, column] <= bound[row, column] + np.float32(_STEP_M):
-                weight[row, column] = share[row, column]
-    plane = _fit_plane(where, lowest, weight)
+    """Run the steps: cells, bound, plane; once more along that plane; membrane; heights."""
+    plane = np.zeros(3)
+    for _ in range(2):
+        # The second time "lowest" and "flat" are meant along the slope that the first time found.
+        lowest, where, share = _lowest_of_cells(points, cells, plane)
+        bound = _steepest_bound(lowest)
+        _bound_by_rays(bound, lowest, where, sensor_height)
+        weight = np.zeros((cells, cells), np.float32)
+        for row in range(cells):
+            for column in range(cells):
+                if lowest[row, column] <= bound[row, column] + np.float32(_STEP_M):
+                    weight[row, column] = share[row, column] * share[row, column]
+        plane = _fit_plane(where, lowest, weight, plane)
 
     # From here on everything is measured from the plane.
     target = np.zeros((cells, cells), np.float32)
@@ -71,23 +74,25 @@ def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int
             ceiling[row, column] = bound[row, column] + 0.1 - (plane[0] * x + plane[1] * y + plane[2])
     ground = np.zeros((cells, cells), np.float32)
     robust = weight.copy()
-    for _ in range(3):
+    for scale in (1.0, 0.5, 0.25):
         _stretch(ground, target, robust, ceiling)
         for row in range(cells):
             for column in range(cells):
                 if weight[row, column] > 0:
-                    above = (target[row, column] - ground[row, column]) / np.float32(0.2)
+                    above = (target[row, column] - ground[row, column]) / np.float32(scale)
                     robust[row, column] = weight[row, column] / (np.float32(1.0) + above * above)
     _stretch(ground, target, robust, ceiling)
-    return _heights_above(points, plane, ground)
+    heights: Float32Array = _heights_above(points, plane, ground)
+    return heights
 
 
 @njit(cache=True, nogil=True)
-def _lowest_of_cells(points: Float32Array, cells: int):  # type: ignore[no-untyped-def]
+def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array):  # type: ignore[no-untyped-def]
     """Return each cell's lowest z (infinite where there is none to trust), its x and y, and how flat the cell is.
 
-    Flat is the share of the points up to 2 m above the lowest that lie within 0.3 m of it: 1 on a road, little where
-    a wall stands. A lowest point without a second one near it, or far below all cells around, is a reflection.
+    Lowest is the point that lies lowest over the plane. Flat is the share of the points up to 2 m above it that lie
+    within 0.3 m of it: 1 on a road, little where a wall stands. A lowest point without a second one near it, or far
+    below all cells around, is a reflection.
     """
     inverse = np.float32(1.0 / _CELL_M)
     half = np.float32(cells * _CELL_M / 2)
@@ -96,6 +101,8 @@ def _lowest_of_cells(points: Float32Array, cells: int):  # type: ignore[no-untyp
     low = np.zeros((cells, cells), np.int32)
     near = np.zeros((cells, cells), np.int32)
     cell_of = np.empty(points.shape[0], np.int32)
+    over = np.empty(points.shape[0], np.float32)
+    a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         cell_of[i] = -1
@@ -106,31 +113,32 @@ def _lowest_of_cells(points: Float32Array, cells: int):  # type: ignore[no-untyp
             continue
         row, column = min(int((y + half) * inverse), cells - 1), min(int((x + half) * inverse), cells - 1)
         cell_of[i] = row * cells + column
-        if z < lowest[row, column]:
-            lowest[row, column] = z
+        over[i] = z - (a * x + b * y + c)
+        if over[i] < lowest[row, column]:
+            lowest[row, column] = over[i]
             where[row, column, 0] = x
             where[row, column, 1] = y
     for i in range(points.shape[0]):
         if cell_of[i] >= 0:
             row, column = cell_of[i] // cells, cell_of[i] % cells
-            above = points[i, 2] - lowest[row, column]
+            above = over[i] - lowest[row, column]
             if above < np.float32(2.0):
                 near[row, column] += 1
                 if above < np.float32(0.3):
                     low[row, column] += 1
     share = np.zeros((cells, cells), np.float32)
-    trusted = lowest.copy()
+    trusted = np.full((cells, cells), np.inf, np.float32)
     for row in range(cells):
         for column in range(cells):
-            if low[row, column] < 2 or _is_pit_of_scan(lowest, row, column):
-                trusted[row, column] = np.inf
-            else:
+            if low[row, column] >= 2 and not _is_pit_of_scan(lowest, row, column):
                 share[row, column] = low[row, column] / near[row, column]
+                x, y = where[row, column, 0], where[row, column, 1]
+                trusted[row, column] = lowest[row, column] + (a * x + b * y + c)
     return trusted, where, share
 
 
 @njit(cache=True, nogil=True)
-def _is_pit_of_scan(lowest: Float32Array, row: int, column: int) -> bool:
+def _is_pit_of_scan(lowest: Float32Array, row: int, column: int):  # type: ignore[no-untyped-def]
     """Return whether at least three cells around are occupied and all lie far above this one."""
     n = lowest.shape[0]
     others = 0
@@ -208,7 +216,7 @@ def _bound_by_rays(bound: Float32Array, lowest: Float32Array, where: Float32Arra
 
 
 @njit(cache=True, nogil=True)
-def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array) -> Float64Array:
+def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, plane: Float64Array) -> Float64Array:
     """Return the plane z = a x + b y + c through the cells' lowest points, held by the base that stands at z = 0.
 
     Cells off the last plane count less (Cauchy), those above it least: what stands on the ground is above it. Cells
@@ -224,28 +232,32 @@ def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array) 
                 z[count] = lowest[row, column]
                 w[count] = weight[row, column] / (1.0 + (x[count] ** 2 + y[count] ** 2) / 400.0)
                 count += 1
-    plane = np.zeros(3)
+    pa, pb, pc = plane
     for _ in range(8):
-        A = np.zeros((3, 3))
-        r = np.zeros(3)
-        A[0, 0] = A[1, 1] = 40.0  # flat unless the rings say otherwise
-        A[2, 2] = 20.0
+        xx, yy = 40.0, 40.0  # flat unless the rings say otherwise
+        n1 = 20.0
+        xy, x1, y1, xz, yz, z1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(count):
-            off = z[i] - (plane[0] * x[i] + plane[1] * y[i] + plane[2])
+            off = z[i] - (pa * x[i] + pb * y[i] + pc)
             scaled = off / (0.15 if off > 0 else 0.4)
-            wi = w[i] / (1.0 + scaled * scaled)
-            A[0, 0] += wi * x[i] * x[i]
-            A[0, 1] += wi * x[i] * y[i]
-            A[0, 2] += wi * x[i]
-            A[1, 1] += wi * y[i] * y[i]
-            A[1, 2] += wi * y[i]
-            A[2, 2] += wi
-            r[0] += wi * x[i] * z[i]
-            r[1] += wi * y[i] * z[i]
-            r[2] += wi * z[i]
-        A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
-        plane = np.linalg.solve(A, r)
-    return plane
+            v = w[i] / (1.0 + scaled * scaled)
+            xx += v * x[i] * x[i]
+            xy += v * x[i] * y[i]
+            x1 += v * x[i]
+            yy += v * y[i] * y[i]
+            y1 += v * y[i]
+            n1 += v
+            xz += v * x[i] * z[i]
+            yz += v * y[i] * z[i]
+            z1 += v * z[i]
+        # Cramer's rule: symmetric, positive definite, and quicker to compile than LAPACK.
+        c00, c01, c02 = yy * n1 - y1 * y1, x1 * y1 - xy * n1, xy * y1 - x1 * yy
+        c11, c12, c22 = xx * n1 - x1 * x1, xy * x1 - xx * y1, xx * yy - xy * xy
+        determinant = xx * c00 + xy * c01 + x1 * c02
+        pa = (c00 * xz + c01 * yz + c02 * z1) / determinant
+        pb = (c01 * xz + c11 * yz + c12 * z1) / determinant
+        pc = (c02 * xz + c12 * yz + c22 * z1) / determinant
+    return np.array([pa, pb, pc])
 
 
 @njit(cache=True, nogil=True)
