@@ -1,0 +1,244 @@
+"""The plan of a town: streets and blocks on squared paper, and the warp that makes them a place of its own.
+
+A plan is drawn in (u, v) metres with axis-parallel streets, which keeps every family's drawing simple; `Warp` bends,
+shears and turns it into local (x, y). What is drawn is collected by `Plan` as rows of numbers, so that a town of ten
+thousand parts becomes triangles in a few numpy calls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from crossloc3d_ros.simulation.scene import Label
+from crossloc3d_ros.types import Float64Array
+
+Layout = Literal["grid", "irregular", "curved"]
+
+
+class Rect(NamedTuple):
+    """A rectangle of the plan."""
+
+    u0: float
+    v0: float
+    u1: float
+    v1: float
+
+    @property
+    def width(self) -> float:
+        return self.u1 - self.u0
+
+    @property
+    def height(self) -> float:
+        return self.v1 - self.v0
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        return 0.5 * (self.u0 + self.u1), 0.5 * (self.v0 + self.v1)
+
+    def inset(self, by: float) -> Rect:
+        """Return the rectangle drawn in by `by` metres on every side."""
+        return Rect(self.u0 + by, self.v0 + by, self.u1 - by, self.v1 - by)
+
+
+class Street(NamedTuple):
+    """A strip between blocks, along u or along v."""
+
+    rect: Rect
+    along_u: bool
+    level: int
+    """0 the town's first divisions, growing towards the lanes."""
+
+    @property
+    def width(self) -> float:
+        return self.rect.height if self.along_u else self.rect.width
+
+    @property
+    def length(self) -> float:
+        return self.rect.width if self.along_u else self.rect.height
+
+    def at(self, along: float, across: float) -> tuple[float, float]:
+        """Return the plan position `along` metres from the start and `across` metres left of the middle line."""
+        centre_u, centre_v = self.rect.centre
+        if self.along_u:
+            return self.rect.u0 + along, centre_v + across
+        return centre_u - across, self.rect.v0 + along
+
+    @property
+    def yaw_rad(self) -> float:
+        return 0.0 if self.along_u else float(np.pi / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Plan (u, v) to local (x, y): waves, a shear, a turn; smooth and without folds."""
+
+    waves: Float64Array
+    """(W, 6) wave vector u, v [rad/m]; phase; displacement u, v [m]; unused."""
+    linear: Float64Array
+    """(2, 2) turn and shear."""
+
+    def __call__(self, uv: npt.NDArray[np.floating]) -> Float64Array:
+        """Return local positions (..., 2) of plan positions (..., 2)."""
+        flat = np.asarray(uv, dtype=np.float64)
+        moved = flat.copy()
+        for ku, kv, phase, du, dv, _ in self.waves:
+            wave = np.sin(flat[..., 0] * ku + flat[..., 1] * kv + phase)
+            moved[..., 0] += du * wave
+            moved[..., 1] += dv * wave
+        return moved @ self.linear.T
+
+    def yaw(self, uv: Float64Array, yaw_plan: Float64Array) -> Float64Array:
+        """Return the local heading (N,) of a plan heading at plan positions (N, 2)."""
+        step = 0.5 * np.stack([np.cos(yaw_plan), np.sin(yaw_plan)], -1)
+        ahead = self(uv + step) - self(uv - step)
+        return np.asarray(np.arctan2(ahead[:, 1], ahead[:, 0]), dtype=np.float64)
+
+
+def draw_warp(layout: Layout, rng: np.random.Generator) -> Warp:
+    """Return a warp in the manner of `layout`; its local stretch stays under about a third."""
+    bands = {
+        "grid": [(500.0, 900.0, 0.06, 1)],
+        "irregular": [(350.0, 700.0, 0.16, 2), (110.0, 200.0, 0.07, 2)],
+        "curved": [(280.0, 600.0, 0.30, 2), (150.0, 260.0, 0.06, 1)],
+    }[layout]
+    waves = []
+    for low, high, slope, count in bands:
+        for _ in range(count):
+            wavelength, direction, push = rng.uniform(low, high), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+            number = 2 * np.pi / wavelength
+            amplitude = slope / number * rng.uniform(0.6, 1.0) / np.sqrt(count)
+            waves.append([number * np.cos(direction), number * np.sin(direction), rng.uniform(0, 2 * np.pi),
+                          amplitude * np.cos(push), amplitude * np.sin(push), 0.0])  # fmt: skip
+    turn = rng.uniform(0, 2 * np.pi)
+    shear = rng.uniform(-0.25, 0.25) if layout != "grid" else rng.uniform(-0.08, 0.08)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return Warp(np.array(waves), rotation @ np.array([[1.0, shear], [0.0, 1.0]]))
+
+
+def draw_streets(
+    extent: Rect, block_m: tuple[float, float], street_m: tuple[float, float, float], jitter: float,
+    rng: np.random.Generator,
+) -> tuple[list[Rect], list[Street]]:  # fmt: skip
+    """Divide `extent` into blocks by streets.
+
+    `block_m` least and greatest side of a block, `street_m` widths of main streets, streets and lanes, `jitter` 0 to 1:
+    how far from the middle a division may lie.
+    """
+    blocks: list[Rect] = []
+    streets: list[Street] = []
+    pending = [(extent, 0)]
+    while pending:
+        rect, level = pending.pop()
+        target = rng.uniform(*block_m)
+        longer = max(rect.width, rect.height)
+        if longer < 1.5 * target or longer < 2 * block_m[0] + street_m[0]:
+            blocks.append(rect)
+            continue
+        rank = 0 if level < 3 else 1 if level < 7 else 2
+        width = street_m[rank] * rng.uniform(0.75, 1.35)
+        share = 0.5 + jitter * rng.uniform(-0.3, 0.3)
+        if rect.width >= rect.height:
+            middle = rect.u0 + share * rect.width
+            streets.append(Street(Rect(middle - width / 2, rect.v0, middle + width / 2, rect.v1), False, level))
+            halves = (Rect(rect.u0, rect.v0, middle - width / 2, rect.v1), Rect(middle + width / 2, rect.v0, *rect[2:]))
+        else:
+            middle = rect.v0 + share * rect.height
+            streets.append(Street(Rect(rect.u0, middle - width / 2, rect.u1, middle + width / 2), True, level))
+            halves = (Rect(rect.u0, rect.v0, rect.u1, middle - width / 2), Rect(rect.u0, middle + width / 2, *rect[2:]))
+        pending += [(half, level + 1) for half in halves]
+    return blocks, streets
+
+
+BROADLEAF, CONIFER, COLUMN, BUSH = range(4)
+
+
+@dataclass(eq=False)
+class Plan:
+    """Everything drawn so far, in plan coordinates; heights are above the ground at the part's anchor."""
+
+    wings: list[tuple[float, ...]] = field(default_factory=list)
+    """8 corner coordinates, bottom (NaN: down into the ground), eave, ridge, hip, label, owner."""
+    anchors: list[tuple[float, float]] = field(default_factory=list)
+    """Where each owner (a building and all that stands on it) meets the ground."""
+    trees: list[tuple[float, ...]] = field(default_factory=list)
+    """u, v, kind, height, crown radius, crown base as share of the height."""
+    cars: list[tuple[float, ...]] = field(default_factory=list)
+    """u, v, yaw, chance that a car stands here, size class."""
+    poles: list[tuple[float, ...]] = field(default_factory=list)
+    """u, v, height, radius at the foot, radius at the top, label."""
+    water: list[Rect] = field(default_factory=list)
+    pedestrians: list[Rect] = field(default_factory=list)
+    """Where people may stand."""
+
+    def owner(self, u: float, v: float) -> int:
+        """Register a building whose ground floor lies at the height of the ground at (u, v)."""
+        self.anchors.append((u, v))
+        return len(self.anchors) - 1
+
+    def wing(
+        self,
+        owner: int,
+        rect: Rect,
+        eave: float,
+        ridge: float | None = None,
+        *,
+        along_u: bool | None = None,
+        hip: float = 0.0,
+        bottom: float = float("nan"),
+        label: Label = Label.BUILDING,
+    ) -> None:
+        """Draw a part of a building; the ridge runs along u, along v, or along the longer side."""
+        along = rect.width >= rect.height if along_u is None else along_u
+        u0, v0, u1, v1 = rect
+        corners = (u0, v0, u1, v0, u1, v1, u0, v1) if along else (u1, v0, u1, v1, u0, v1, u0, v0)
+        self.wings.append((*corners, bottom, eave, eave if ridge is None else ridge, hip, float(label), float(owner)))
+
+    def barrier(self, u0: float, v0: float, u1: float, v1: float, thick: float, height: float, label: Label) -> None:
+        """Draw a hedge, wall or fence along an axis-parallel line, in pieces that follow the bends."""
+        length = max(abs(u1 - u0), abs(v1 - v0))
+        pieces = max(1, int(length / 12.0))
+        for i in range(pieces):
+            a, b = i / pieces, (i + 1) / pieces
+            start_u, start_v = u0 + a * (u1 - u0), v0 + a * (v1 - v0)
+            end_u, end_v = u0 + b * (u1 - u0), v0 + b * (v1 - v0)
+            rect = Rect(min(start_u, end_u) - thick / 2, min(start_v, end_v) - thick / 2,
+                        max(start_u, end_u) + thick / 2, max(start_v, end_v) + thick / 2)  # fmt: skip
+            self.wing(self.owner(*rect.centre), rect, height, label=label)
+
+    def enclosure(self, rect: Rect, thick: float, height: float, label: Label, rng: np.random.Generator) -> None:
+        """Draw a barrier around a rectangle with a gate somewhere in one of its sides."""
+        sides = [
+            (rect.u0, rect.v0, rect.u1, rect.v0), (rect.u1, rect.v0, rect.u1, rect.v1),
+            (rect.u0, rect.v1, rect.u1, rect.v1), (rect.u0, rect.v0, rect.u0, rect.v1),
+        ]  # fmt: skip
+        gate = int(rng.integers(4))
+        for i, (u0, v0, u1, v1) in enumerate(sides):
+            if i != gate:
+                self.barrier(u0, v0, u1, v1, thick, height, label)
+                continue
+            opening, width = rng.uniform(0.2, 0.8), 4.0 / max(abs(u1 - u0), abs(v1 - v0), 4.0)
+            for a, b in ((0.0, opening - width / 2), (opening + width / 2, 1.0)):
+                if b > a:
+                    self.barrier(u0 + a * (u1 - u0), v0 + a * (v1 - v0), u0 + b * (u1 - u0), v0 + b * (v1 - v0),
+                                 thick, height, label)  # fmt: skip
+
+    def tree(
+        self, u: float, v: float, rng: np.random.Generator, *, height: tuple[float, float] = (6.0, 14.0),
+        kinds: tuple[float, float, float, float] = (0.8, 0.1, 0.05, 0.05),
+    ) -> None:  # fmt: skip
+        """Draw a tree of a kind chosen by the shares `kinds` (broadleaf, conifer, column, bush)."""
+        draw = rng.random(5)
+        kind = int(np.searchsorted(np.cumsum(kinds), draw[0] * sum(kinds), side="right"))
+        tall = height[0] + draw[1] * (height[1] - height[0])
+        if kind == BROADLEAF:
+            self.trees.append((u, v, kind, tall, tall * (0.24 + 0.18 * draw[2]), 0.18 + 0.22 * draw[3]))
+        elif kind == CONIFER:
+            self.trees.append((u, v, kind, 1.25 * tall, tall * (0.16 + 0.1 * draw[2]), 0.08 + 0.1 * draw[3]))
+        elif kind == COLUMN:
+            self.trees.append((u, v, kind, 1.4 * tall, 0.1 * tall + 0.5 * draw[2], 0.1))
+        else:
+            self.trees.append((u, v, BUSH, 1.5 + 2.5 * draw[1], 1.0 + 1.3 * draw[2], 0.0))
