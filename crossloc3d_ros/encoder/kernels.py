@@ -22,6 +22,9 @@ from numba.extending import intrinsic
 COLUMNS = 16
 """Columns of a weight panel: two AVX2 registers, one AVX-512, four NEON."""
 
+UNROLL = 4
+"""Input channels that the register tile takes at a time."""
+
 MAX_DENSE_CELLS = 1 << 24
 """Largest bounding box (in cells) that is looked up in a dense table; beyond it sorted keys are searched."""
 
@@ -30,10 +33,20 @@ def _make_tile(n_rows: int) -> Any:
     """Emit the register tile for `n_rows` input rows against one panel of 16 weight columns."""
 
     @intrinsic
-    def tile(typingctx: Any, x: Any, w: Any, out: Any, w_at: Any, depth: Any, x_at: Any, out_at: Any) -> Any:
-        signature = types.void(
-            x, w, out, types.intp, types.intp, types.UniTuple(types.intp, n_rows), types.UniTuple(types.intp, n_rows)
-        )
+    def tile(
+        typingctx: Any,
+        x: Any,
+        w: Any,
+        out: Any,
+        w_at: Any,
+        depth: Any,
+        x_step: Any,
+        w_step: Any,
+        x_at: Any,
+        out_at: Any,
+    ) -> Any:
+        rows_at = types.UniTuple(types.intp, n_rows)
+        signature = types.void(x, w, out, *[types.intp] * 4, rows_at, rows_at)
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             single = ir.FloatType()
@@ -49,7 +62,7 @@ def _make_tile(n_rows: int) -> Any:
             fma = cgutils.get_or_insert_function(
                 builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{COLUMNS}f32"
             )
-            rows = [builder.gep(data(0), [builder.extract_value(args[5], r)]) for r in range(n_rows)]
+            rows = [builder.gep(data(0), [builder.extract_value(args[7], r)]) for r in range(n_rows)]
             panel = builder.gep(data(1), [args[3]])
             sums = [cgutils.alloca_once(builder, vector) for _ in range(n_rows)]
             zero = ir.Constant(vector, [0.0] * COLUMNS)
@@ -57,15 +70,26 @@ def _make_tile(n_rows: int) -> Any:
                 builder.store(zero, total)
             undefined = ir.Constant(vector, ir.Undefined)
             lanes = ir.Constant(ir.VectorType(ir.IntType(32), COLUMNS), [0] * COLUMNS)
-            with cgutils.for_range(builder, args[4], intp=word) as loop:
-                weights = load_vector(builder.gep(panel, [builder.mul(loop.index, word(COLUMNS))]))
+
+            def accumulate(index: Any) -> None:
+                weights = load_vector(builder.gep(panel, [builder.mul(index, args[6])]))
+                x_index = builder.mul(index, args[5])
                 for row, total in zip(rows, sums, strict=True):
-                    value = builder.load(builder.gep(row, [loop.index]))
+                    value = builder.load(builder.gep(row, [x_index]))
                     first = builder.insert_element(undefined, value, ir.IntType(32)(0))
                     broadcast = builder.shuffle_vector(first, undefined, lanes)
                     builder.store(builder.call(fma, [broadcast, weights, builder.load(total)]), total)
+
+            unrolled = builder.udiv(args[4], word(UNROLL))
+            with cgutils.for_range(builder, unrolled, intp=word) as loop:
+                start = builder.mul(loop.index, word(UNROLL))
+                for step in range(UNROLL):
+                    accumulate(builder.add(start, word(step)))
+            done = builder.mul(unrolled, word(UNROLL))
+            with cgutils.for_range(builder, builder.sub(args[4], done), intp=word) as loop:
+                accumulate(builder.add(done, loop.index))
             for r, total in enumerate(sums):
-                target = builder.bitcast(builder.gep(data(2), [builder.extract_value(args[6], r)]), vector.as_pointer())
+                target = builder.bitcast(builder.gep(data(2), [builder.extract_value(args[8], r)]), vector.as_pointer())
                 builder.store(builder.fadd(builder.load(target, align=4), builder.load(total)), target, align=4)
             return context.get_dummy_value()
 
@@ -92,9 +116,10 @@ def pack_weights(weights: Any) -> Any:
 
 @njit(cache=True, nogil=True, boundscheck=False)
 def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any, last: Any, out: Any) -> None:
-    """Add `x[i] @ weights[k]` to `out[o]` for the pairs (i, o) = (in_rows, out_rows)[first[k]:last[k]] of each kernel k.
+    """Add `x[i] @ weights[k]` to `out[o]` for the pairs (i, o) of each kernel k.
 
-    x (N, Cin) and out (M, Cout) float32, C-contiguous; packed from `pack_weights`; Cout a multiple of 16.
+    Kernel k's pairs are (in_rows, out_rows)[first[k]:last[k]]; x (N, Cin) and out (M, Cout) float32, C-contiguous;
+    packed from `pack_weights`; Cout a multiple of 16.
     Within one kernel an output row must not occur twice.
     """
     kernels, panels, depth, _ = packed.shape
@@ -113,6 +138,8 @@ def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any,
                     out_flat,
                     w_at,
                     depth,
+                    1,
+                    COLUMNS,
                     (
                         np.intp(in_rows[p]) * x_step,
                         np.intp(in_rows[p + 1]) * x_step,
@@ -138,6 +165,8 @@ def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any,
                     out_flat,
                     w_at,
                     depth,
+                    1,
+                    COLUMNS,
                     (
                         np.intp(in_rows[p]) * x_step,
                         np.intp(in_rows[p + 1]) * x_step,
@@ -159,6 +188,8 @@ def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any,
                     out_flat,
                     w_at,
                     depth,
+                    1,
+                    COLUMNS,
                     (np.intp(in_rows[p]) * x_step, np.intp(in_rows[p + 1]) * x_step),
                     (np.intp(out_rows[p]) * out_step + shift, np.intp(out_rows[p + 1]) * out_step + shift),
                 )
@@ -170,36 +201,94 @@ def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any,
                     out_flat,
                     w_at,
                     depth,
+                    1,
+                    COLUMNS,
                     (np.intp(in_rows[p]) * x_step,),
                     (np.intp(out_rows[p]) * out_step + shift,),
                 )
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
-def dense_product(x: Any, packed: Any, begin: int, end: int, out: Any) -> None:
-    """Add `x[begin:end] @ weights` to `out[begin:end]`; the one kernel of `packed`, Cout a multiple of 16."""
-    _, panels, depth, _ = packed.shape
-    x_flat, w_flat, out_flat = x.ravel(), packed.ravel(), out.ravel()
-    xs, os = x.shape[1], out.shape[1]
-    for panel in range(panels):
-        w_at = panel * depth * COLUMNS
-        shift = panel * COLUMNS
+def strided_product(
+    x: Any,
+    x_at: int,
+    x_row: int,
+    x_step: int,
+    w: Any,
+    w_at: int,
+    w_panel: int,
+    w_step: int,
+    out: Any,
+    out_at: int,
+    out_row: int,
+    depth: int,
+    width: int,
+    begin: int,
+    end: int,
+) -> None:
+    """Add `x @ w` to `out` for the rows [begin, end), on flat float32 arrays with steps of the caller's choice.
+
+    Row r, depth d of x lies at `x_at + r x_row + d x_step`; depth d of the 16 columns of panel p of w at
+    `w_at + p w_panel + d w_step`; row r of out at `out_at + r out_row`. `width` is a multiple of 16.
+    """
+    for panel in range(width // COLUMNS):
+        w_from = w_at + panel * w_panel
+        shift = out_at + panel * COLUMNS
         i = begin
         while i + 6 <= end:
-            a, o = i * xs, i * os + shift
+            a, o = x_at + i * x_row, i * out_row + shift
             _tile6(
-                x_flat,
-                w_flat,
-                out_flat,
-                w_at,
+                x,
+                w,
+                out,
+                w_from,
                 depth,
-                (a, a + xs, a + 2 * xs, a + 3 * xs, a + 4 * xs, a + 5 * xs),
-                (o, o + os, o + 2 * os, o + 3 * os, o + 4 * os, o + 5 * os),
+                x_step,
+                w_step,
+                (a, a + x_row, a + 2 * x_row, a + 3 * x_row, a + 4 * x_row, a + 5 * x_row),
+                (o, o + out_row, o + 2 * out_row, o + 3 * out_row, o + 4 * out_row, o + 5 * out_row),
             )
             i += 6
+        if i + 4 <= end:
+            a, o = x_at + i * x_row, i * out_row + shift
+            _tile4(
+                x,
+                w,
+                out,
+                w_from,
+                depth,
+                x_step,
+                w_step,
+                (a, a + x_row, a + 2 * x_row, a + 3 * x_row),
+                (o, o + out_row, o + 2 * out_row, o + 3 * out_row),
+            )
+            i += 4
         while i < end:
-            _tile1(x_flat, w_flat, out_flat, w_at, depth, (i * xs,), (i * os + shift,))
+            _tile1(x, w, out, w_from, depth, x_step, w_step, (x_at + i * x_row,), (i * out_row + shift,))
             i += 1
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def dense_product(x: Any, packed: Any, out: Any, begin: int, end: int) -> None:
+    """Add `x @ weights` to `out` for the rows [begin, end); packed (Cout / 16, Cin, 16)."""
+    panels, depth, _ = packed.shape
+    strided_product(
+        x.ravel(),
+        0,
+        x.shape[1],
+        1,
+        packed.ravel(),
+        0,
+        depth * COLUMNS,
+        COLUMNS,
+        out.ravel(),
+        0,
+        out.shape[1],
+        depth,
+        panels * COLUMNS,
+        begin,
+        end,
+    )
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -222,7 +311,6 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
     n_kernels = kernel_size**3
     n_clouds = len(starts) - 1
     n_queries = len(queries)
-    n_inputs = len(coords)
     found = np.full((n_kernels, n_queries), -1, np.int32)
     first = np.zeros(n_kernels + 1, np.int64)
     low = np.empty(3, np.int64)
@@ -294,5 +382,4 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
                 in_rows[p] = n
                 out_rows[p] = m
                 p += 1
-    assert n_inputs >= 0
     return in_rows, out_rows, first

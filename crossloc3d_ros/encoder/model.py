@@ -60,7 +60,7 @@ class ChannelAttention(nn.Module):
 
     def forward(self, x: Tensor, grid: VoxelGrid) -> Tensor:
         scale = torch.sigmoid(self.conv(cloud_mean(x, grid).unsqueeze(1)).squeeze(1))  # (B, C)
-        return x * scale[grid.batch]
+        return x * scale.index_select(0, grid.batch)
 
 
 class SelectionBlock(nn.Module):
@@ -87,16 +87,17 @@ class SelectionBlock(nn.Module):
 
     def forward(self, x: Tensor, grid: VoxelGrid) -> Tensor:
         outputs = []
-        for layers, attention in zip(self.branches, self.attentions, strict=True):
+        for sizes, layers, attention in zip(self.KERNELS, self.branches, self.attentions, strict=True):
             y = x
-            for i, layer in enumerate(layers):  # type: ignore[arg-type]
-                y = layer(F.relu(y) if i else y, grid)  # no ReLU at a branch's end
+            for i in range(len(sizes)):
+                y = layers[i](F.relu(y) if i else y, grid)  # type: ignore[index]  # no ReLU at a branch's end
             outputs.append(attention(y, grid))
         stacked = torch.stack(outputs, dim=1)  # (N, 5, C)
         if not self.kept:
             return stacked.mean(dim=1)
         summed = torch.zeros_like(x)
-        for (first, second), y in zip(self.transforms, outputs, strict=True):  # type: ignore[misc]
+        for pair, y in zip(self.transforms, outputs, strict=True):
+            first, second = list(pair)  # type: ignore[call-overload]
             summed = summed + second(F.relu(first(y, grid)), grid)
         gate = torch.softmax(self.gate(summed, grid).view(stacked.shape), dim=1)
         if self.kept < len(self.KERNELS):
@@ -160,7 +161,7 @@ class RefinementLayer(nn.Module):
         values = self.value(self.centers.t()).view(memory, self.heads, -1)
         attention = torch.softmax(torch.einsum("nhd,hdm->nhm", query, keys), dim=2)
         sums = attention.new_zeros(n_clouds, self.heads, memory).index_add(0, batch, attention)
-        attention = attention / (1e-9 + sums)[batch]
+        attention = attention / (1e-9 + sums).index_select(0, batch)
         read = torch.einsum("nhm,mhd->nhd", attention, values).reshape(n, channels)
         refined: Tensor = x + F.relu(self.norm(self.transform(read - x)))
         return refined

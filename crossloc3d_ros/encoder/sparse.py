@@ -115,7 +115,7 @@ def _build_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> Kernel
 
 
 def search_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> KernelMap:
-    """Build the kernel map by binary search in sorted keys, with torch alone: the way on CUDA, the oracle on the CPU."""
+    """Build the kernel map by binary search with torch alone: the way on CUDA, the oracle on the CPU."""
     radius = kernel_size // 2 * source.stride
     low = torch.minimum(source.coords.amin(0), target.coords.amin(0)).long() - radius
     extent = torch.maximum(source.coords.amax(0), target.coords.amax(0)).long() + radius - low + 1

@@ -1,0 +1,274 @@
+"""The network of `model.py` once more, as the CPU runs it fastest: folded, compiled, one cloud at a time.
+
+Batch norms are folded into the weights before them, what depends on the weights alone is computed once, and each stage
+is one compiled kernel over a range of rows, so that a few threads share it. `model.py` says what is computed; the
+tests hold the two together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from torch import Tensor, nn
+
+from crossloc3d_ros.encoder import stages
+from crossloc3d_ros.encoder.kernels import COLUMNS, dense_product, kernel_map, pack_weights
+from crossloc3d_ros.encoder.model import ConvolutionNorm, CrossLoc3D, Grain, RefinementLayer
+from crossloc3d_ros.types import Float32Array, Int32Array, Int64Array
+
+MIN_ROWS_TO_SHARE = 64
+"""Below this many rows a stage is quicker on one thread than handed out."""
+
+
+class _Layer(NamedTuple):
+    """A linear layer with its batch norm folded in."""
+
+    weights: Float32Array
+    """Packed for the kernels: (K^3, Cout / 16, Cin, 16), or without the first axis for K = 1."""
+    shift: Float32Array
+    """(Cout,)."""
+
+
+class CompiledModel:
+    """A trained model, folded and packed; safe to use from several threads at once.
+
+    Needs widths that fill whole vectors: see `can_compile`.
+    """
+
+    def __init__(self, model: CrossLoc3D, threads: int = 1) -> None:
+        config = model.config
+        self._sub_steps = config.sub_steps
+        self._team = Team(threads)
+        self._grains = [_FoldedGrain(cast(Grain, grain)) for grain in model.grains]
+        if config.refinement != "fine_to_coarse":
+            self._grains.reverse()
+        self._steps: list[_FoldedStep] = []
+        if model.refinement is not None:
+            for number, layer in enumerate(model.refinement.layers):
+                time = model.refinement.time
+                embedding = np.zeros(config.channels, np.float32) if time is None else _array(time(number))
+                self._steps.append(_FoldedStep(cast(RefinementLayer, layer), embedding))
+        scale, self._fusion_shift = _folded_norm(model.fusion_norm)
+        fusion = (_array(model.fusion.weight) * scale[:, None]).reshape(len(scale), -1, config.channels)
+        blocks = np.ascontiguousarray(fusion.transpose(1, 2, 0))  # (stages, C, F)
+        # A grain that is not refined yet stands as it came in every stage up to its own: those weights add up here.
+        self._raw_fusion = [
+            _packed(blocks[: grain + 1 if self._steps else 1].sum(axis=0)) for grain in range(len(self._grains))
+        ]
+        self._refined_fusion = [_packed(block) for block in blocks[1:]]
+        pool = model.pooling
+        scale, shift = _folded_norm(pool.assignment_norm)
+        self._assignment = _Layer(_packed(_array(pool.assignment) * scale), shift)
+        self._centers = _array(pool.centers)
+        scale, shift = _folded_norm(pool.output_norm)
+        self._projection = _Layer(_array(pool.projection) * scale, shift)
+        scale, shift = _folded_norm(pool.gating_norm)
+        self._gating = _Layer(_array(pool.gating) * scale, shift)
+
+    @staticmethod
+    def can_compile(model: CrossLoc3D) -> bool:
+        """Say whether every width of the model is a multiple of the vector width."""
+        config = model.config
+        widths = [config.channels, config.fused_channels, config.clusters, config.channels // config.heads]
+        if model.refinement is not None:
+            widths += list(config.memory_sizes)
+        return all(width % COLUMNS == 0 for width in widths)
+
+    def encode(self, points: Float32Array) -> Float32Array:
+        """Return the descriptor (D,) of the points (n, 3) float32 in [-1, 1]."""
+        grains = [grain.encode(points, self._team) for grain in self._grains]
+        ends = np.cumsum([len(x) for x in grains]).tolist()
+        x = np.concatenate(grains)
+        fused = _rows(self._fusion_shift, len(x))
+        for begin, end, weights in zip([0, *ends[:-1]], ends, self._raw_fusion, strict=True):
+            self._team.share(end - begin, dense_product, x[begin:end], weights, fused[begin:end])
+        for number, step in enumerate(self._steps):
+            grain, sub_step = divmod(number, self._sub_steps)
+            step.refine(x[: ends[grain]], self._team)
+            if sub_step == self._sub_steps - 1:
+                self._team.share(ends[grain], dense_product, x, self._refined_fusion[grain], fused)
+        return self._pool(fused)
+
+    def _pool(self, fused: Float32Array) -> Float32Array:
+        n, channels = fused.shape
+        soft = _rows(self._assignment.shift, n)
+        self._team.share(n, stages.assign, fused, self._assignment.weights, soft)
+        sums = np.zeros((channels, soft.shape[1]), np.float32)
+        self._team.share(channels, stages.aggregate, fused, soft, sums)
+        y = self._project(stages.residuals(sums, soft, self._centers), self._projection)
+        gate = self._project(y, self._gating)
+        return y / (np.float32(1.0) + np.exp(-gate))
+
+    def _project(self, x: Float32Array, layer: _Layer) -> Float32Array:
+        parts = np.zeros((self._team.threads, len(layer.shift)), np.float32)
+        self._team.share(len(x), stages.project, x, layer.weights, parts, numbered=True)
+        total: Float32Array = parts.sum(axis=0) + layer.shift
+        return total
+
+
+class Team:
+    """A few threads that share the rows of a stage; the caller is one of them."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = max(1, threads)
+        self._pool = ThreadPoolExecutor(self.threads - 1, "encoder") if self.threads > 1 else None
+
+    def parts(self, rows: int) -> int:
+        """Return on how many threads a stage of so many rows should run."""
+        return self.threads if rows >= MIN_ROWS_TO_SHARE else 1
+
+    def share(self, rows: int, kernel: Callable[..., None], *args: Any, numbered: bool = False) -> None:
+        """Run `kernel(*args, begin, end)` over equal ranges of the rows; `numbered` adds the range's number."""
+        count = self.parts(rows)
+        bounds = [rows * part // count for part in range(count + 1)]
+        ranges = [(bounds[part], bounds[part + 1], part) for part in range(count)]
+        self.run(ranges if numbered else [part[:2] for part in ranges], kernel, *args)
+
+    def run(self, parts: list[Any], kernel: Callable[..., None], *args: Any) -> None:
+        """Run `kernel(*args, *part)` for every part, the first in the calling thread; wait for all."""
+        waiting = [self._pool.submit(kernel, *args, *part) for part in parts[1:]] if self._pool is not None else []
+        kernel(*args, *parts[0])
+        for future in waiting:
+            future.result()
+
+
+class _Pairs:
+    """A kernel map, with each thread's share of every kernel's pairs."""
+
+    def __init__(self, sites: Int32Array, output: Int32Array, kernel_size: int, stride: int, team: Team) -> None:
+        starts, output_starts = np.array([0, len(sites)]), np.array([0, len(output)])
+        self.in_rows, self.out_rows, first = kernel_map(sites, starts, output, output_starts, kernel_size, stride)
+        self.n_rows = len(output)
+        rows, begin, end = stages.split_pairs(self.out_rows, first, self.n_rows, team.parts(self.n_rows))
+        self.shares: list[tuple[Int64Array, Int64Array, int, int]] = [
+            (begin[part], end[part], int(rows[part]), int(rows[part + 1])) for part in range(len(begin))
+        ]
+
+    def convolve(
+        self, x: Float32Array, layer: _Layer, team: Team, *, relu: bool, out: Float32Array | None = None
+    ) -> Float32Array:
+        out = np.empty((self.n_rows, len(layer.shift)), np.float32) if out is None else out
+        out[:] = layer.shift
+        team.run(self.shares, stages.convolve, x, layer.weights, self.in_rows, self.out_rows, relu, out)
+        return out
+
+
+class _FoldedGrain:
+    def __init__(self, grain: Grain) -> None:
+        block = grain.selection
+        self._voxel_size = np.float32(grain.voxel_size)
+        weights, self._stem_shift = _folded(grain.stem)
+        self._stem = np.ascontiguousarray(weights[:, 0])  # (125, C)
+        self._down = _layer(grain.down)
+        branches = [[_layer(cast(ConvolutionNorm, m)) for m in cast(nn.ModuleList, b)] for b in block.branches]
+        _, self._b1, self._b2, self._b3, self._b4 = branches
+        self._attention = np.stack([_array(cast(Any, a).conv.weight).reshape(3) for a in block.attentions])
+        self._kept = block.kept
+        if block.kept:
+            pairs = [[_layer(cast(ConvolutionNorm, m)) for m in cast(nn.ModuleList, t)] for t in block.transforms]
+            gate = _layer(block.gate)
+            self._gate = (
+                np.stack([first.weights for first, _ in pairs]),
+                np.stack([first.shift for first, _ in pairs]),
+                np.stack([second.weights for _, second in pairs]),
+                np.sum([second.shift for _, second in pairs], axis=0, dtype=np.float32),
+                gate.weights,
+                gate.shift,
+            )
+
+    def encode(self, points: Float32Array, team: Team) -> Float32Array:
+        """Return the grain's features (N, C) on the sites of stride 2."""
+        sites = stages.voxels(points, self._voxel_size)
+        coarse = stages.coarser(sites)
+        fine = _rows(self._stem_shift, len(sites))
+        team.share(len(sites), stages.stem, *stages.occupancy(sites, 5), self._stem, fine)
+        x = _Pairs(sites, coarse, 3, 1, team).convolve(fine, self._down, team, relu=True)
+        near, far = _Pairs(coarse, coarse, 3, 2, team), _Pairs(coarse, coarse, 5, 2, team)
+        branches = np.empty((5, *x.shape), np.float32)
+        branches[0] = x
+        (first, second), out = self._b1, branches[1]
+        near.convolve(_dense_relu(x, first, team), second, team, relu=False, out=out)
+        (first, second), out = self._b2, branches[2]
+        near.convolve(near.convolve(x, first, team, relu=True), second, team, relu=False, out=out)
+        (first, second, third), out = self._b3, branches[3]
+        y = far.convolve(_dense_relu(x, first, team), second, team, relu=True)
+        near.convolve(y, third, team, relu=False, out=out)
+        (first, second, third), out = self._b4, branches[4]
+        y = far.convolve(_dense_relu(x, first, team), second, team, relu=True)
+        far.convolve(y, third, team, relu=False, out=out)
+        scales = stages.channel_attention(branches, self._attention)
+        if not self._kept:
+            mean: Float32Array = (branches * scales[:, None]).mean(axis=0)
+            return mean
+        selected = np.empty_like(x)
+        team.share(len(x), stages.select, branches, scales, *self._gate, self._kept, selected)
+        return selected
+
+
+class _FoldedStep:
+    def __init__(self, layer: RefinementLayer, embedding: Float32Array) -> None:
+        self._embedding = embedding
+        self._heads = layer.heads
+        channels, memory = layer.centers.shape
+        query = _array(layer.query.weight).reshape(layer.heads, -1, channels)  # (H, d, C)
+        centers = _array(layer.centers).reshape(layer.heads, -1, memory)  # (H, d, M)
+        keys = np.einsum("hdc,hdm->chm", query, centers).reshape(channels, -1)
+        self._keys = _packed(keys)
+        values = _array(layer.value(layer.centers.t())).reshape(memory, layer.heads, -1)
+        self._values = np.stack([_packed(values[:, head]) for head in range(layer.heads)])  # (H, panels, M, 16)
+        scale, shift = _folded_norm(layer.norm)
+        self._transform = _packed(_array(layer.transform.weight).T * scale)
+        self._shift = _array(layer.transform.bias) * scale + shift
+
+    def refine(self, x: Float32Array, team: Team) -> None:
+        """Apply the layer to the rows of x (N, C), in place."""
+        attention = np.empty((len(x), self._keys.shape[0] * COLUMNS), np.float32)
+        sums = np.zeros((team.threads, attention.shape[1]), np.float32)
+        args = (x, self._embedding, self._keys, self._heads, attention, sums)
+        team.share(len(x), stages.attend, *args, numbered=True)
+        values = stages.scale_values(self._values, sums)
+        team.share(len(x), stages.read_memory, x, attention, values, self._transform, self._shift, x)
+
+
+def _dense_relu(x: Float32Array, layer: _Layer, team: Team) -> Float32Array:
+    out = _rows(layer.shift, len(x))
+    team.share(len(x), stages.dense_relu, x, layer.weights, out)
+    return out
+
+
+def _rows(row: Float32Array, count: int) -> Float32Array:
+    """Return `count` copies of a row."""
+    out = np.empty((count, len(row)), np.float32)
+    out[:] = row
+    return out
+
+
+def _array(tensor: Tensor) -> Float32Array:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float32)
+
+
+def _folded_norm(norm: nn.BatchNorm1d) -> tuple[Float32Array, Float32Array]:
+    """Return scale and shift of `y = scale x + shift`."""
+    mean, variance = cast(Tensor, norm.running_mean).double(), cast(Tensor, norm.running_var).double()
+    scale = norm.weight.detach().double() / (variance + norm.eps).sqrt()
+    return _array(scale), _array(norm.bias.detach().double() - mean * scale)
+
+
+def _folded(layer: ConvolutionNorm) -> tuple[Float32Array, Float32Array]:
+    scale, shift = _folded_norm(layer.norm)
+    return _array(layer.weight) * scale, shift
+
+
+def _layer(layer: ConvolutionNorm) -> _Layer:
+    weights, shift = _folded(layer)
+    packed = pack_weights(weights)
+    return _Layer(packed[0] if layer.kernel_size == 1 else packed, shift)
+
+
+def _packed(weights: Float32Array) -> Float32Array:
+    """Pack one matrix (Cin, Cout) as (Cout / 16, Cin, 16)."""
+    packed: Float32Array = pack_weights(np.ascontiguousarray(weights, np.float32)[None])[0]
+    return packed
