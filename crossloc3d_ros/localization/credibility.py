@@ -63,7 +63,8 @@ def candidate_probabilities(distances: Float32Array, calibration: CalibrationCon
         return np.empty(0)
     distances_64 = np.asarray(distances, dtype=np.float64)
     some = expit((calibration.none_distance - distances_64.min()) / calibration.none_scale)
-    return np.asarray(some * softmax(-distances_64 / calibration.temperature))
+    with np.errstate(invalid="ignore"):  # infinitely far from everything: no number, and so no fix
+        return np.asarray(some * softmax(-distances_64 / calibration.temperature))
 
 
 def judge(candidates: Candidates, enu: Float64Array, config: CredibilityConfig) -> Belief:

@@ -10,7 +10,7 @@ from crossloc3d_ros.types import Candidates, Float32Array
 
 def retrieve(descriptor: Float32Array, aerial_map: AerialMap, top_k: int, calibration: CalibrationConfig) -> Candidates:
     """Return the `top_k` submaps, fewer on a small map, that look most like `descriptor` (D,), best first."""
-    submap_ids, distances = aerial_map.index.search(descriptor, min(top_k, len(aerial_map.submaps.grid)))
+    submap_ids, distances = aerial_map.index.search(descriptor, top_k)
     return Candidates(
         submap_ids=submap_ids,
         descriptor_distances=distances,

@@ -1,0 +1,171 @@
+"""The facade: with an encoder that needs no training, on a map of a few made-up places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from crossloc3d_ros.clouds.scan import prepare_scan
+from crossloc3d_ros.config import (
+    BuildConfig,
+    CalibrationConfig,
+    CredibilityConfig,
+    LocalizerConfig,
+    PreprocessingConfig,
+)
+from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.localization.localizer import Localizer
+from crossloc3d_ros.places.descriptor_map import DescriptorMap
+from crossloc3d_ros.places.store import AerialMap, BuildCounts, Manifest, SubmapTable
+from crossloc3d_ros.types import Estimate, FixStatus, Scan
+
+Float32 = npt.NDArray[np.float32]
+ORIGIN = np.array([628_500.0, 5_804_000.0, 2.0])
+PLACES = 30
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+class HistogramEncoder:
+    """A histogram over distance and height: the same from every heading, and different from place to place."""
+
+    fingerprint = "histogram"
+    descriptor_size = 64
+    preprocessing = PreprocessingConfig()
+    calibration = CalibrationConfig(temperature=0.01, none_distance=0.05, none_scale=0.005)
+
+    def encode(self, points: Float32) -> Float32:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        counts, _, _ = np.histogram2d(radius, points[:, 2], bins=8, range=((0, 1.42), (0, 0.4)))
+        return (counts.ravel() / len(points)).astype(np.float32)
+
+    def encode_batch(self, clouds: Sequence[Float32]) -> Float32:
+        return np.stack([self.encode(cloud) for cloud in clouds])
+
+    def warm_up(self) -> None:
+        pass
+
+
+def scan_of_place(seed: int, heading_rad: float = 0.0) -> Scan:
+    """A level street floor and a few walls; the place is the seed."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(-40, 40, (9000, 2)), rng.normal(-1.2, 0.01, 9000)])
+    walls = []
+    for _ in range(6):
+        centre, along, height = rng.uniform(-35, 35, 2), rng.uniform(0, np.pi), rng.uniform(2, 15)
+        if np.linalg.norm(centre) < 8:
+            centre *= 8 / np.linalg.norm(centre)
+        run = rng.uniform(-5, 5, 900)
+        walls.append(np.column_stack([centre[0] + run * np.cos(along), centre[1] + run * np.sin(along),
+                                      rng.uniform(-1.2, height - 1.2, 900)]))  # fmt: skip
+    points = np.vstack([floor, *walls])
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
+    return Scan(turned.astype(np.float32), STAMP_NS, "velodyne")
+
+
+def grid_of_place(i: int) -> npt.NDArray[np.float64]:
+    return ORIGIN + np.array([120.0 * (i % 6), 120.0 * (i // 6), 0.5 * i])
+
+
+@pytest.fixture(scope="module")
+def aerial_map() -> AerialMap:
+    encoder, config = HistogramEncoder(), LocalizerConfig()
+    descriptors = []
+    for i in range(PLACES):
+        patch = prepare_scan(scan_of_place(i), config.scan, encoder.preprocessing).patch
+        assert patch is not None
+        descriptors.append(encoder.encode(patch.points))
+    manifest = Manifest(
+        crs="EPSG:32631", origin=tuple(ORIGIN), bounds=(0.0, 0.0, 1.0, 1.0), vertical_reference="unknown",
+        geoid_separation_m=None, encoder_fingerprint=encoder.fingerprint, descriptor_size=64,
+        preprocessing=encoder.preprocessing, build=BuildConfig(),
+        ground="classes", counts=BuildCounts(), sources=(), files=(), created="", software="",
+    )  # fmt: skip
+    grid = np.array([grid_of_place(i) for i in range(PLACES)])
+    submaps = SubmapTable(grid, np.full(PLACES, 4096, np.int32))
+    frame = MapFrame("EPSG:32631", ORIGIN)
+    return AerialMap(Path(), manifest, frame, submaps, DescriptorMap(np.array(descriptors)))
+
+
+@pytest.fixture(scope="module")
+def localizer(aerial_map: AerialMap) -> Localizer:
+    return Localizer(aerial_map, HistogramEncoder(), LocalizerConfig())
+
+
+@pytest.mark.parametrize("place", [0, 7, 29])
+@pytest.mark.parametrize("heading_rad", [0.0, 0.7, 3.0])
+def test_a_scan_is_found_where_it_was_taken_from_every_heading(
+    localizer: Localizer, place: int, heading_rad: float
+) -> None:
+    estimate = localizer.localize(scan_of_place(place, heading_rad))
+    assert estimate.status is FixStatus.FIX, estimate.reason
+    assert estimate.stamp_ns == STAMP_NS
+    assert estimate.candidates.submap_ids[0] == place
+    assert np.linalg.norm(estimate.grid[:2] - grid_of_place(place)[:2]) < 25.0
+
+
+def test_grid_enu_and_latitude_longitude_are_the_same_place(localizer: Localizer) -> None:
+    estimate = localizer.localize(scan_of_place(11))
+    frame = localizer.aerial_map.frame
+    np.testing.assert_allclose(frame.to_enu(estimate.grid[None])[0], estimate.enu, atol=1e-3)
+    back = frame.from_geographic(np.array([estimate.latitude_deg]), np.array([estimate.longitude_deg]))
+    np.testing.assert_allclose(back[0, :2], estimate.grid[:2], atol=1e-3)
+    assert np.isnan(estimate.altitude_m), "the map does not know its geoid"
+
+
+def test_the_same_scan_gives_the_same_estimate(localizer: Localizer) -> None:
+    first, second = (localizer.localize(scan_of_place(3)) for _ in range(2))
+    np.testing.assert_array_equal(first.candidates.descriptor_distances, second.candidates.descriptor_distances)
+    np.testing.assert_array_equal(first.grid, second.grid)
+
+
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        (np.empty((0, 3)), "empty"),
+        (np.full((28_800, 3), np.nan), "0 of 28,800 points left"),
+        (np.full((28_800, 3), 1e30), "0 of 28,800 points left"),
+        (np.vstack([np.full((28_797, 3), np.nan), np.full((3, 3), 9.0)]), "3 of 28,800 points left after filtering"),
+        (np.random.default_rng(0).uniform(2, 9, (12, 3)), "12"),
+        (np.column_stack([np.random.default_rng(0).uniform(-30, 30, (9000, 2)), np.full(9000, -1.2)]), "above the gr"),
+    ],
+    ids=["empty", "all NaN", "1e30 m away", "3 left", "twelve points", "bare ground"],
+)
+def test_a_scan_without_use_gives_no_fix_and_the_reason(localizer: Localizer, points: Float32, reason: str) -> None:
+    estimate = localizer.localize(Scan(points.astype(np.float32), STAMP_NS, "velodyne"))
+    assert estimate.status is FixStatus.NO_FIX
+    assert reason in estimate.reason
+    assert len(estimate.candidates) == 0
+    assert np.isnan([*estimate.grid, *estimate.enu, estimate.latitude_deg, estimate.longitude_deg]).all()
+    assert estimate.counts.received == len(points)
+
+
+def test_a_scan_from_nowhere_gives_no_fix(localizer: Localizer) -> None:
+    box = np.random.default_rng(5).uniform([-3, -3, -1.2], [3, 3, 1.8], (9000, 3))
+    box[:4500, 0] = 3.0
+    estimate = localizer.localize(Scan(box.astype(np.float32), STAMP_NS, "velodyne"))
+    assert estimate.status is FixStatus.NO_FIX
+    assert "nothing in the map looks like the scan" in estimate.reason
+    assert len(estimate.candidates) == 25
+
+
+def test_settings_override_the_calibration_of_the_weights(aerial_map: AerialMap) -> None:
+    def localize(credibility: CredibilityConfig) -> Estimate:
+        config = LocalizerConfig(top_k=5, credibility=credibility)
+        return Localizer(aerial_map, HistogramEncoder(), config).localize(scan_of_place(4))
+
+    assert localize(CredibilityConfig()).status is FixStatus.FIX
+    doubtful = CredibilityConfig(none_distance=1e-6, none_scale=0.01, min_probability=0.9)
+    assert localize(doubtful).status is FixStatus.NO_FIX
+    assert localize(CredibilityConfig(temperature=1e3)).status is FixStatus.NO_FIX, "all candidates alike"
+    assert len(localize(CredibilityConfig()).candidates) == 5
+
+
+def test_warm_up_leaves_nothing_behind(aerial_map: AerialMap) -> None:
+    cold, warm = (Localizer(aerial_map, HistogramEncoder(), LocalizerConfig()) for _ in range(2))
+    warm.warm_up()
+    np.testing.assert_array_equal(cold.localize(scan_of_place(2)).grid, warm.localize(scan_of_place(2)).grid)
