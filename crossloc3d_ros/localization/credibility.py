@@ -104,12 +104,16 @@ def calibrate(
     candidates lie from where the scan was taken: infinite for scans from outside of the map, which belong in here
     so that the answer 'nowhere' is learned. A candidate is right within `radius_m`.
     """
-    near = [np.asarray(d, dtype=np.float64) for d in distances]
-    right = [np.asarray(s, dtype=np.float64) <= radius_m for s in separations_m]
-    best = np.array([d.min() for d in near])
-    found = np.array([r.any() for r in right])
+    width = max(len(row) for row in distances)
+    # Rows of fewer candidates are filled up with some that are infinitely far and wrong.
+    near = np.array([np.pad(row, (0, width - len(row)), constant_values=np.inf) for row in distances], np.float64)
+    apart = np.array([np.pad(row, (0, width - len(row)), constant_values=np.inf) for row in separations_m], np.float64)
+    right = apart <= radius_m
+    best = near.min(axis=1)
+    found = right.any(axis=1)
     scale = float(np.std(best)) or 1.0
     initial = start or CalibrationConfig(temperature=scale, none_distance=float(np.median(best)), none_scale=scale)
+    near_found, right_near = near[found], np.where(right, near, np.inf)[found]
 
     def presence_loss(x: Float64Array) -> float:
         z = (x[0] - best) * np.exp(-x[1])
@@ -117,8 +121,8 @@ def calibrate(
         return float(np.sum(np.logaddexp(0.0, np.where(found, -z, z))) + 1e-2 * (x[1] - np.log(scale)) ** 2)
 
     def choice_loss(x: Float64Array) -> float:
-        logits = [-d * np.exp(-x[0]) for d in near]
-        losses = [logsumexp(v) - logsumexp(v[r]) for v, r, f in zip(logits, right, found, strict=True) if f]
+        beta = np.exp(-x[0])
+        losses = logsumexp(-beta * near_found, axis=1) - logsumexp(-beta * right_near, axis=1)
         return float(np.sum(losses) + 1e-2 * (x[0] - np.log(scale)) ** 2)
 
     presence = minimize(presence_loss, [initial.none_distance, np.log(initial.none_scale)], method="Nelder-Mead").x
