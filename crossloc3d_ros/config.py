@@ -142,11 +142,14 @@ class PlacesConfig:
 
     families: tuple[str, ...] = option((), "kinds of towns, taken in turns; empty = all that the simulator knows")
     town_size_m: float = option(400.0, "side of a town", low=200.0, high=2000.0)
-    scans: int = option(240, "scans of each town", low=1, high=100_000)
+    scans: int = option(120, "scans of each town to learn from", low=1, high=100_000)
+    validation_scans: int = option(40, "scans of each town to validate on", low=1, high=100_000)
+    survey_spacing_m: float = option(0.35, "distance between neighbouring pulses of a survey", low=0.05, high=5.0)
     spacing_m: float = option(19.0, "distance between the centres of validation submaps", low=1.0, high=1000.0)
     cell_m: float = option(1.0, "cell of the terrain raster", low=0.1, high=10.0)
     sensor_height_m: tuple[float, float] = option((0.9, 1.6), "lowest and highest lidar above the ground", low=0.2)
-    tilt_deg: float = option(1.5, "standard deviation of the robot's roll and pitch", low=0.0, high=15.0)
+    tilt_deg: float = option(1.0, "standard deviation of roll and pitch, added to the slope's", low=0.0, high=15.0)
+    imu_share: float = option(0.5, "share of the scans that an IMU levels", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)

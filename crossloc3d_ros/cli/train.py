@@ -47,10 +47,14 @@ def _parser() -> argparse.ArgumentParser:
     common.add_options(run, TrainConfig)
     run.set_defaults(action=_run)
 
-    export = commands.add_parser("export", help="write the weights of a run, also of one that is still going or was killed")
+    export = commands.add_parser(
+        "export", help="write the weights of a run, also of one that is still going or was killed"
+    )
     export.add_argument("run", type=Path, help="folder of the run")
     export.add_argument("--places", type=Path, help="folder of make-places, if it has moved")
-    export.add_argument("--output", type=Path, required=True, help="file to write (.safetensors); the card lies beside it")
+    export.add_argument(
+        "--output", type=Path, required=True, help="file to write (.safetensors); the card lies beside it"
+    )
     export.set_defaults(action=_export)
     for command in (places, run, export):
         common.add_verbosity(command)
@@ -88,7 +92,9 @@ def _run(arguments: argparse.Namespace) -> int:
     validation = trainer.run(resume=arguments.resume)
     trainer.write_card()
     for recall in validation.recalls:
-        print(f"{recall.label:>5} within {recall.radius_m:3.0f} m: {100 * recall.value:5.1f} %  (chance {100 * recall.chance:.1f} %)")
+        print(
+            f"{recall.label:>5} within {recall.radius_m:3.0f} m: {100 * recall.value:5.1f} %  (chance {100 * recall.chance:.1f} %)"
+        )
     return 0
 
 

@@ -142,9 +142,7 @@ class Trainer:
         torch.set_num_threads(config.threads)
         manifest = read_manifest(self.places)
         run_folder.prepare(self.folder, config, manifest, self.places, resume=resume)
-        sampler = BatchSampler(
-            [read_training_town(self.places / t.file) for t in manifest.of_role(TRAINING)], config
-        )
+        sampler = BatchSampler([read_training_town(self.places / t.file) for t in manifest.of_role(TRAINING)], config)
         held_out = load_validation(self.places, manifest)
         state = new_state(config)
         saved = run_folder.load_state(self.folder) if resume else None
@@ -213,9 +211,7 @@ class Trainer:
                 if recall > state.best_recall:
                     state.best_recall = recall
                     run_folder.export(self.folder / run_folder.BEST, averaged, config, metadata)
-                self.report(
-                    Progress(state.step, share, loss, rate, 0.0, 0.0, validation)
-                )
+                self.report(Progress(state.step, share, loss, rate, 0.0, 0.0, validation))
                 state.elapsed_s = self.clock() - started
                 last_logged, logged_step = state.elapsed_s, state.step
             if state.elapsed_s - last_saved >= 60.0 * config.save_minutes:

@@ -73,7 +73,11 @@ def _distances(entry: dict[str, Any]) -> str:
 
 
 def _course(validations: list[dict[str, Any]]) -> str:
-    lines = ["## How it got there\n", "| minutes | steps | R@1 100 m | R@1 25 m | R@25 100 m |", "|---|---|---|---|---|"]
+    lines = [
+        "## How it got there\n",
+        "| minutes | steps | R@1 100 m | R@1 25 m | R@25 100 m |",
+        "|---|---|---|---|---|",
+    ]
     for entry in validations:
         value = {(r["label"], r["radius_m"]): 100 * r["value"] for r in entry["recalls"]}
         lines.append(
@@ -97,7 +101,9 @@ def _data(manifest: Manifest) -> str:
         towns = manifest.of_role(role)
         cut = submaps or f"{sum(t.submaps for t in towns):,}"
         lines.append(f"| {role} | {len(towns)} | {_families(towns)} | {sum(t.scans for t in towns):,} | {cut} |")
-    lines.append(f"\nSettings: `{json.dumps(settings['places'])}`, preprocessing `{json.dumps(settings['preprocessing'])}`")
+    lines.append(
+        f"\nSettings: `{json.dumps(settings['places'])}`, preprocessing `{json.dumps(settings['preprocessing'])}`"
+    )
     return "\n".join(lines) + "\n"
 
 
@@ -109,40 +115,52 @@ def _families(towns: list[TownEntry]) -> str:
 
 
 def _training(
-    settings: dict[str, Any], steps: list[dict[str, Any]], starts: list[dict[str, Any]], last: dict[str, Any], resumed: int
+    settings: dict[str, Any],
+    steps: list[dict[str, Any]],
+    starts: list[dict[str, Any]],
+    last: dict[str, Any],
+    resumed: int,
 ) -> str:
     first = starts[0]
     samples = 2 * settings["pairs"] * last["step"]
     loss = f"{steps[-1]['loss']:.3f}" if steps else "unknown"
-    hardware = f"{first['processor']}, {first['threads']} of {first['cores']} cores, accelerator: {first['accelerator']}"
+    hardware = (
+        f"{first['processor']}, {first['threads']} of {first['cores']} cores, accelerator: {first['accelerator']}"
+    )
     recipe = {key: value for key, value in settings.items() if key not in ("model", "preprocessing", "device")}
-    return "\n".join(
-        [
-            "## Training\n",
-            f"* Command: `train run --places PLACES --output RUN {first.get('budget', '')}`, seed {settings['seed']}; "
-            f"interrupted and resumed {resumed} times.",
-            f"* {last['step']:,} steps, {samples:,} clouds, {last['elapsed_s'] / 3600:.2f} hours, validation included; "
-            f"training loss at the end {loss}.",
-            f"* Machine: {hardware}. Python {first['python']}, torch {first['torch']}, numpy {first['numpy']}.",
-            f"* Network: `{json.dumps(settings['model'])}`",
-            f"* Recipe: `{json.dumps(recipe)}`",
-            "* AdamW, warm-up and cosine over the budget, clipped gradients, averaged weights with batch-norm statistics "
-            "of their own; both sides of a pair are turned over the full circle, mirrored together, scans thinned and "
-            "partly blocked; the loss is on the Euclidean distance that the map is searched by.",
-        ]
-    ) + "\n"
+    return (
+        "\n".join(
+            [
+                "## Training\n",
+                f"* Command: `train run --places PLACES --output RUN {first.get('budget', '')}`, seed {settings['seed']}; "
+                f"interrupted and resumed {resumed} times.",
+                f"* {last['step']:,} steps, {samples:,} clouds, {last['elapsed_s'] / 3600:.2f} hours, validation included; "
+                f"training loss at the end {loss}.",
+                f"* Machine: {hardware}. Python {first['python']}, torch {first['torch']}, numpy {first['numpy']}.",
+                f"* Network: `{json.dumps(settings['model'])}`",
+                f"* Recipe: `{json.dumps(recipe)}`",
+                "* AdamW, warm-up and cosine over the budget, clipped gradients, averaged weights with batch-norm statistics "
+                "of their own; both sides of a pair are turned over the full circle, mirrored together, scans thinned and "
+                "partly blocked; the loss is on the Euclidean distance that the map is searched by.",
+            ]
+        )
+        + "\n"
+    )
 
 
 def _limits() -> str:
-    return "\n".join(
-        [
-            "## What it cannot do\n",
-            "* It has seen simulated towns only: real buildings, trees and sensors differ, and the figures above do not "
-            "carry over to them. Judge it on a drive through a real survey before relying on it.",
-            "* It tells places apart by what stands above the ground within 50 m. Open fields, water, forests without "
-            "structure, tunnels and interiors give it nothing to go by.",
-            "* It knows one sensor (16 beams, -15 to +15 degrees) at 0.9 to 1.6 m above the ground, standing upright "
-            "within a few degrees.",
-            "* A descriptor gives a place, not a heading, and not a metre: the nearest submap's centre is the answer.",
-        ]
-    ) + "\n"
+    return (
+        "\n".join(
+            [
+                "## What it cannot do\n",
+                "* It has seen simulated towns only: real buildings, trees and sensors differ, and the figures above do not "
+                "carry over to them. Judge it on a drive through a real survey before relying on it.",
+                "* It tells places apart by what stands above the ground within 50 m. Open fields, water, forests without "
+                "structure, tunnels and interiors give it nothing to go by.",
+                "* It knows one sensor (16 beams, -15 to +15 degrees) at 0.9 to 1.6 m above the ground, standing upright "
+                "within a few degrees.",
+                "* A descriptor gives a place, not a heading, and not a metre: the nearest submap's centre is the answer.",
+            ]
+        )
+        + "\n"
+    )

@@ -144,7 +144,9 @@ def machine(config: TrainConfig) -> dict[str, str]:
     processor = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
         processor = names[0] if names else processor
     return {
         "processor": processor,
@@ -185,5 +187,3 @@ def export(path: Path, model: CrossLoc3D, config: TrainConfig, extra: dict[str, 
         save_checkpoint(path, model, config.preprocessing, extra, dtype="float16")
     except OSError as error:
         raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
-
-

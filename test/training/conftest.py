@@ -114,7 +114,9 @@ def write_places(folder: Path, towns: int = 4) -> Path:
     held_out = validation_town(1000, TINY_TRAINING.preprocessing)
     write_town(folder / "validation_1000.npz", held_out)
     entries.append(
-        TownEntry("validation_1000.npz", "validation", "boxes", 1000, len(held_out.query_xy_m), len(held_out.submap_xy_m), 1.0)
+        TownEntry(
+            "validation_1000.npz", "validation", "boxes", 1000, len(held_out.query_xy_m), len(held_out.submap_xy_m), 1.0
+        )
     )
     settings = {
         "towns": towns,

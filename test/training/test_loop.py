@@ -52,9 +52,7 @@ def test_learning_lowers_the_loss_and_beats_chance_on_an_unseen_town(
     places: Path, tmp_path: Path, tiny: TrainConfig
 ) -> None:
     losses: list[float] = []
-    trainer = Trainer(
-        tiny, places, tmp_path / "run", Budget(steps=80), report=lambda p: losses.append(p.loss)
-    )
+    trainer = Trainer(tiny, places, tmp_path / "run", Budget(steps=80), report=lambda p: losses.append(p.loss))
     recall = trainer.run().recall("R@1", 50.0)
     assert sum(losses[-5:]) < 0.6 * sum(losses[:5])
     assert recall.value > recall.chance

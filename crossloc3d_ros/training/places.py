@@ -1,0 +1,265 @@
+"""Places to learn from: simulated towns, flown over at one epoch and driven through at another."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crossloc3d_ros.clouds.filters import mounting_matrix
+from crossloc3d_ros.clouds.patch import choose_points
+from crossloc3d_ros.clouds.raster import terrain_raster
+from crossloc3d_ros.clouds.scan import prepare_scan
+from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
+from crossloc3d_ros.config import MountingConfig, PlacesConfig, PreprocessingConfig, ScanConfig, to_dict
+from crossloc3d_ros.errors import ConfigError, TrainingError
+from crossloc3d_ros.simulation.families import FAMILIES
+from crossloc3d_ros.simulation.survey import SurveyConfig, fly
+from crossloc3d_ros.simulation.town import Town, make_town
+from crossloc3d_ros.simulation.vlp16 import Vlp16
+from crossloc3d_ros.training.shards import (
+    MANIFEST,
+    TRAINING,
+    VALIDATION,
+    Manifest,
+    TownEntry,
+    TrainingTown,
+    ValidationTown,
+    read_manifest,
+    write_manifest,
+    write_town,
+)
+from crossloc3d_ros.types import Float32Array, Float64Array, Scan
+
+GROUND_CLASS = 2
+_SEEDS_A_SET = 100_000
+_VALIDATION_SEEDS = 50_000
+_DIAGONAL = 2.0**0.5 + 0.01
+_MOST_SCAN_POINTS = 30_000
+
+
+@dataclass(frozen=True)
+class TownTask:
+    """One town to be made."""
+
+    file: str
+    role: str
+    family: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Made:
+    """How far the making is, for whoever shows it."""
+
+    done: int
+    total: int
+    town: TownEntry
+    remaining_s: float
+
+
+def plan_towns(seed: int, towns: int, validation_towns: int, families: Sequence[str]) -> list[TownTask]:
+    """Return the towns of a set, validation first, families in turns; more towns extend a set, they do not change it."""
+    if towns < 0 or validation_towns < 0 or max(towns, validation_towns) > _VALIDATION_SEEDS:
+        raise ConfigError(
+            f"a set holds 0 to {_VALIDATION_SEEDS:,} towns of each role, asked for {towns} and {validation_towns}"
+        )
+    unknown = sorted(set(families) - set(FAMILIES))
+    if unknown:
+        raise ConfigError(f"unknown families: {', '.join(unknown)}; known are: {', '.join(sorted(FAMILIES))}")
+    names = list(families) or sorted(FAMILIES)
+    tasks = []
+    for role, count, first in ((VALIDATION, validation_towns, _VALIDATION_SEEDS), (TRAINING, towns, 0)):
+        for i in range(count):
+            town_seed = seed * _SEEDS_A_SET + first + i
+            family = names[i % len(names)]
+            tasks.append(TownTask(f"{role}_{town_seed}_{family}.npz", role, family, town_seed))
+    return tasks
+
+
+def make_places(
+    output: Path,
+    *,
+    towns: int,
+    validation_towns: int,
+    seed: int,
+    config: PlacesConfig,
+    preprocessing: PreprocessingConfig,
+    workers: int = 1,
+    report: Callable[[Made], None] = lambda made: None,
+) -> Manifest:
+    """Make the towns that `output` does not hold yet and return the manifest of all.
+
+    A folder that holds places of other settings raises TrainingError. Stopped at any moment, the next call goes on.
+    """
+    tasks = plan_towns(seed, towns, validation_towns, config.families)
+    settings = {
+        "seed": seed,
+        "towns": towns,
+        "validation_towns": validation_towns,
+        "places": to_dict(config),
+        "preprocessing": to_dict(preprocessing),
+    }
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainingError(f"cannot make {output}: {error.strerror or error}") from error
+    made: dict[str, TownEntry] = {}
+    if (output / MANIFEST).exists():
+        before = read_manifest(output)
+        _check_same(output, dict(before.settings), settings)
+        made = {town.file: town for town in before.towns if (output / town.file).exists()}
+    missing = [task for task in tasks if task.file not in made]
+    started = time.monotonic()
+    for done, entry in enumerate(_make_all(output, missing, config, preprocessing, workers), start=1):
+        made[entry.file] = entry
+        write_manifest(output, _manifest(settings, tasks, made))
+        remaining_s = (time.monotonic() - started) / done * (len(missing) - done)
+        report(Made(len(made), len(tasks), entry, remaining_s))
+    manifest = _manifest(settings, tasks, made)
+    write_manifest(output, manifest)
+    return manifest
+
+
+def make_town_file(folder: Path, task: TownTask, config: PlacesConfig, preprocessing: PreprocessingConfig) -> TownEntry:
+    """Make one town and write its file."""
+    started = time.perf_counter()
+    town = make_town_places(task, config, preprocessing)
+    write_town(folder / task.file, town)
+    seconds = round(time.perf_counter() - started, 2)
+    if isinstance(town, TrainingTown):
+        return TownEntry(task.file, task.role, task.family, task.seed, len(town), 0, seconds)
+    counts = len(town.query_xy_m), len(town.submap_xy_m)
+    return TownEntry(task.file, task.role, task.family, task.seed, *counts, seconds)
+
+
+def make_town_places(
+    task: TownTask, config: PlacesConfig, preprocessing: PreprocessingConfig
+) -> TrainingTown | ValidationTown:
+    """Simulate one town: its survey at one epoch, scans anywhere in it, at any heading, at the other."""
+    rng = np.random.default_rng(task.seed)
+    flown_epoch = int(rng.integers(2))
+    flown = make_town(task.seed, task.family, config.town_size_m, flown_epoch)
+    driven = make_town(task.seed, task.family, config.town_size_m, 1 - flown_epoch)
+    above_ground = survey_above_ground(flown, config, rng)
+    validating = task.role == VALIDATION
+    count = config.validation_scans if validating else config.scans
+    border_m = preprocessing.half_extent_m + 10.0
+    poses = driven.sample_poses(count, rng, border_m=border_m, tilt_deg=config.tilt_deg)
+    if validating:
+        return _validation_town(task, driven, poses, above_ground, config, preprocessing, rng)
+    return _training_town(task, driven, poses, above_ground, config, preprocessing, rng)
+
+
+def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generator) -> Float64Array:
+    """Fly over a town and return the points (N, 3) x, y and height above the terrain, as the map's builder has them.
+
+    The terrain is made from the points of class ground, not taken from the simulator: the same errors as in a map.
+    """
+    survey = fly(town, SurveyConfig(spacing_m=config.survey_spacing_m), rng)
+    terrain = terrain_raster(survey.points, survey.classification == GROUND_CLASS, tuple(town.bounds), config.cell_m)
+    heights = survey.points[:, 2] - terrain.sample(survey.points[:, 0], survey.points[:, 1])
+    return np.column_stack([survey.points[:, :2], heights])
+
+
+def scan_town(
+    town: Town, T_world_base: Float64Array, config: PlacesConfig, rng: np.random.Generator
+) -> tuple[Scan, ScanConfig, Float64Array | None]:
+    """Scan a town from one pose (4, 4) of the robot; return the scan, its settings and the IMU's "up", at times none."""
+    mounting = MountingConfig(z_m=float(rng.uniform(*config.sensor_height_m)))
+    T_base_lidar = mounting_matrix(mounting)
+    twist = np.array([rng.uniform(0.0, 2.0), 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5)])
+    scan = Vlp16().scan(town.scene, T_world_base @ T_base_lidar, rng, twist).as_scan()
+    up = None
+    if rng.random() < config.imu_share:
+        up = T_world_base[2, :3] + rng.normal(0.0, 0.004, 3)
+    return scan, ScanConfig(mounting=mounting), up
+
+
+def _training_town(
+    task: TownTask, driven: Town, poses: Float64Array, above_ground: Float64Array, config: PlacesConfig,
+    preprocessing: PreprocessingConfig, rng: np.random.Generator,
+) -> TrainingTown:  # fmt: skip
+    # As far as the corners of a turned square, and with every point: the patch is made when the heading is known.
+    reach_m = preprocessing.scan_half_extent_m * _DIAGONAL
+    whole = dataclasses.replace(preprocessing, scan_half_extent_m=reach_m, n_points=_MOST_SCAN_POINTS)
+    places: list[Float64Array] = []
+    scans: list[Float32Array] = []
+    for pose in poses:
+        scan, scan_config, up = scan_town(driven, pose, config, rng)
+        patch = prepare_scan(scan, scan_config, whole, up).patch
+        if patch is not None:
+            places.append(pose[:2, 3])
+            scans.append(patch.points[: patch.source_count] * np.float32(100.0 * reach_m))
+    above = above_ground[above_ground[:, 2] >= preprocessing.ground_clearance_m].astype(np.float32)
+    if preprocessing.thin_m > 0 and len(above):
+        kept, available = choose_points(above, len(above), preprocessing.thin_m, preprocessing.seed)
+        above = kept[:available]
+    return TrainingTown(
+        name=Path(task.file).stem,
+        scan_xy_m=np.array(places).reshape(-1, 2),
+        scan_points_cm=np.rint(np.concatenate([np.empty((0, 3), np.float32), *scans])).astype(np.int16),
+        scan_starts=np.cumsum([0, *(len(scan) for scan in scans)]).astype(np.int64),
+        survey_points=above,
+    )
+
+
+def _validation_town(
+    task: TownTask, driven: Town, poses: Float64Array, above_ground: Float64Array, config: PlacesConfig,
+    preprocessing: PreprocessingConfig, rng: np.random.Generator,
+) -> ValidationTown:  # fmt: skip
+    n_points = preprocessing.n_points
+    cutter = SubmapCutter(above_ground, preprocessing)
+    # Submaps that reach a little beyond the survey, as the builder admits them.
+    inset = 0.8 * preprocessing.half_extent_m
+    low_x, low_y, high_x, high_y = driven.bounds
+    centres = submap_centres((low_x + inset, low_y + inset, high_x - inset, high_y - inset), config.spacing_m)
+    cut = [(centre, patch.points) for centre in centres if (patch := cutter.cut(centre)) is not None]
+    asked = []
+    for pose in poses:
+        scan, scan_config, up = scan_town(driven, pose, config, rng)
+        patch = prepare_scan(scan, scan_config, preprocessing, up).patch
+        if patch is not None:
+            asked.append((pose[:2, 3], patch.points))
+    return ValidationTown(
+        name=Path(task.file).stem,
+        query_xy_m=np.array([place for place, _ in asked]).reshape(-1, 2),
+        query_patches=np.array([points for _, points in asked], np.float32).reshape(-1, n_points, 3),
+        submap_xy_m=np.array([centre for centre, _ in cut]).reshape(-1, 2),
+        submap_patches=np.array([points for _, points in cut], np.float32).reshape(-1, n_points, 3),
+    )
+
+
+def _make_all(
+    folder: Path, tasks: Sequence[TownTask], config: PlacesConfig, preprocessing: PreprocessingConfig, workers: int
+) -> Iterator[TownEntry]:
+    if workers <= 1:
+        for task in tasks:
+            yield make_town_file(folder, task, config, preprocessing)
+        return
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(make_town_file, folder, task, config, preprocessing) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _manifest(settings: dict[str, object], tasks: Sequence[TownTask], made: dict[str, TownEntry]) -> Manifest:
+    return Manifest(settings, tuple(made[task.file] for task in tasks if task.file in made))
+
+
+def _check_same(output: Path, before: dict[str, object], now: dict[str, object]) -> None:
+    for key in ("seed", "places", "preprocessing"):
+        if json.dumps(before.get(key), sort_keys=True) != json.dumps(now[key], sort_keys=True):
+            raise TrainingError(
+                f"{output} holds places of another '{key}' ({before.get(key)}, now {now[key]}): name another folder"
+            )
