@@ -35,6 +35,7 @@ log = logging.getLogger(__name__)
 _MESSAGE_TYPE = re.compile(r"([a-z]\w*)/msg/([A-Z]\w*)")
 _LATE_MS = 100.0
 _ACKNOWLEDGED_WITHIN_S = 2.0
+_SETTLE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,12 @@ class Player:
                     f"nobody subscribed to {waiting} within {self._config.wait_s:g} s; start the localizer with "
                     "'--ros-args -r points:=TOPIC', check that ROS_DOMAIN_ID is the same, or give --wait-s 0"
                 )
+            self._tick(self._bag.start_ns)
+            time.sleep(0.02)
+        # Discovery has two ends: that we know the subscriber does not mean that it knows us, and best effort loses
+        # what comes before.
+        settled = time.monotonic() + _SETTLE_S
+        while time.monotonic() < settled:
             self._tick(self._bag.start_ns)
             time.sleep(0.02)
 

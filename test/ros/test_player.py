@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
 
 from crossloc3d_ros.errors import BagError, CrossLocError
 from crossloc3d_ros.formats import bag
@@ -75,6 +77,10 @@ def cloud_of(i: int, points: int) -> object:
     return bag.velodyne_cloud(START_NS + i * STEP_NS, "velodyne", xyz, 1.0, 3, 0.0)
 
 
+def digest_of(cloud: object) -> str:
+    return hashlib.sha256(cloud.data.tobytes()).hexdigest()
+
+
 def write_drive(path: Path, scans: int = SCANS, points: int = 30_000, storage: bag.Storage = "mcap") -> Path:
     with bag.BagWriter(path, storage) as writer:
         writer.add_topic("/velodyne_points", bag.POINT_CLOUD, OfferedQos("best_effort", "volatile", 5))
@@ -120,64 +126,59 @@ def test_every_cloud_arrives_unchanged_on_time_with_the_clock(tmp_path: Path, ow
     # 660 KB each, best effort as recorded: without the shared-memory profile most would be lost.
     assert heard["cloud_publishers"] == ["2"] or "BEST_EFFORT" in heard["cloud_publishers"][0]
     assert heard["stamps_ns"] == [START_NS + i * STEP_NS for i in range(SCANS)]
-    assert heard["digests"] == [hashlib.sha256(cloud_of(i, 30_000).data.tobytes()).hexdigest() for i in range(SCANS)]
+    assert heard["digests"] == [digest_of(cloud_of(i, 30_000)) for i in range(SCANS)]
     assert heard["fixes"] == [52.5]
     # Deadlines are absolute: over the whole drive the timing neither stretches nor shrinks.
     arrived = np.array(heard["arrived_ns"])
-    assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx((SCANS - 1) * STEP_NS / 1e9, abs=0.15)
+    assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx((SCANS - 1) * STEP_NS / 1e9, abs=0.3)
     assert duration_s == pytest.approx((SCANS - 1) * STEP_NS / 1e9, abs=0.6)
-    assert late_median_ms < 10.0
+    assert late_median_ms < 30.0  # 0.2 ms on a machine with nothing else to do
     # The clock stands at the start while the player waits, then runs at 40 Hz or more and never goes back.
     clocks = np.array(heard["clocks"])
     assert clocks[0] < START_NS + 10 * STEP_NS
     assert (np.diff(clocks) >= 0).all()
     running = clocks[clocks > START_NS]
-    assert len(running) >= 40 * 1.45 * 0.8
+    assert len(running) >= 40 * 1.45
     assert running[-1] <= START_NS + (SCANS - 1) * STEP_NS
 
 
-def test_rate_and_remapping(tmp_path: Path, own_domain: None) -> None:
-    path = tmp_path / "drive"
-    with bag.BagWriter(path, "sqlite3") as writer:
-        for i in range(SCANS):
-            writer.write("/points_raw", bag.POINT_CLOUD, START_NS + i * STEP_NS, cloud_of(i, 1000))
-    listener = listen(30, SCANS)
+def test_a_real_recording_at_four_times_its_speed(own_domain: None, shared) -> None:
+    path = shared("data/vlp16/einride_vlp16_pointcloud2_sqlite3")
+    with bag.open_bag(path) as reader:
+        recorded = [(t_ns, bag.stamp_ns_of(m, 0), digest_of(m)) for _, t_ns, m in reader.messages()]
+    listener = listen(30, len(recorded))
+    player = player_process(path, "play_bag(reader, PlayerConfig(rate=4.0))")
+    heard = heard_by(listener)
+    _, errors = player.communicate(timeout=30)
+    assert player.returncode == 0, errors
+    assert heard["stamps_ns"] == [stamp_ns for _, stamp_ns, _ in recorded]
+    assert heard["digests"] == [digest for _, _, digest in recorded]
+    arrived = np.array(heard["arrived_ns"])
+    seconds = (recorded[-1][0] - recorded[0][0]) / 1e9
+    assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx(seconds / 4, abs=0.2)
+
+
+def test_a_ros_1_bag_under_another_topic(tmp_path: Path, own_domain: None) -> None:
+    path = tmp_path / "old.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    clouds = [cloud_of(i, 1000) for i in range(10)]
+    with Ros1Writer(path) as writer:
+        connection = writer.add_connection("/points_raw", bag.POINT_CLOUD, typestore=store)
+        for number, cloud in enumerate(clouds):
+            head = store.types["std_msgs/msg/Header"](number, cloud.header.stamp, cloud.header.frame_id)
+            values = (cloud.height, cloud.width, cloud.fields, cloud.is_bigendian, cloud.point_step, cloud.row_step)
+            message = store.types[bag.POINT_CLOUD](head, *values, cloud.data, cloud.is_dense)
+            data = store.serialize_ros1(message, bag.POINT_CLOUD)
+            writer.write(connection, START_NS + number * STEP_NS, data)
+    listener = listen(30, len(clouds))
     player = player_process(
-        path, "play_bag(reader, PlayerConfig(rate=3.0), ros_arguments=['-r', '/points_raw:=/velodyne_points'])"
+        path, "play_bag(reader, PlayerConfig(), ros_arguments=['-r', '/points_raw:=/velodyne_points'])"
     )
     heard = heard_by(listener)
     _, errors = player.communicate(timeout=30)
     assert player.returncode == 0, errors
-    assert len(heard["stamps_ns"]) == SCANS
-    arrived = np.array(heard["arrived_ns"])
-    assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx((SCANS - 1) * STEP_NS / 3e9, abs=0.1)
-
-
-def test_a_real_ros_2_bag_and_a_ros_1_bag_arrive(tmp_path: Path, own_domain: None, shared) -> None:
-    from rosbags.rosbag1 import Writer as Ros1Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    source = shared("data/vlp16/einride_vlp16_pointcloud2_sqlite3")
-    store = get_typestore(Stores.ROS1_NOETIC)
-    old = tmp_path / "old.bag"
-    digests, stamps = [], []
-    with bag.open_bag(source) as reader, Ros1Writer(old) as writer:
-        connection = writer.add_connection("/velodyne_points", bag.POINT_CLOUD, typestore=store)
-        for number, (_, t_ns, cloud) in enumerate(reader.messages()):
-            head = store.types["std_msgs/msg/Header"](number, cloud.header.stamp, cloud.header.frame_id)
-            values = (cloud.height, cloud.width, cloud.fields, cloud.is_bigendian, cloud.point_step, cloud.row_step)
-            message = store.types[bag.POINT_CLOUD](head, *values, cloud.data, cloud.is_dense)
-            writer.write(connection, t_ns, store.serialize_ros1(message, bag.POINT_CLOUD))
-            digests.append(hashlib.sha256(cloud.data.tobytes()).hexdigest())
-            stamps.append(bag.stamp_ns_of(cloud, 0))
-    for path in (source, old):
-        listener = listen(30, len(stamps))
-        player = player_process(path, "play_bag(reader, PlayerConfig(rate=4.0))")
-        heard = heard_by(listener)
-        _, errors = player.communicate(timeout=30)
-        assert player.returncode == 0, errors
-        assert heard["stamps_ns"] == stamps
-        assert heard["digests"] == digests
+    assert heard["stamps_ns"] == [START_NS + i * STEP_NS for i in range(len(clouds))]
+    assert heard["digests"] == [digest_of(cloud) for cloud in clouds]
 
 
 def test_nobody_listening_is_said(tmp_path: Path, own_domain: None) -> None:
