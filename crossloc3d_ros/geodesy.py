@@ -77,6 +77,33 @@ def utm_crs_for(longitude_deg: float, latitude_deg: float) -> CRS:
     return CRS.from_epsg((32600 if latitude_deg >= 0.0 else 32700) + int(zone))
 
 
+def utm_crs_of(crs: str, x: float, y: float) -> CRS:
+    """Return the UTM zone (WGS84) of a place given in another CRS (x or longitude first).
+
+    Raises AerialDataError where the place is not on Earth: the CRS is the wrong one then.
+    """
+    longitude, latitude = _transformer(crs, _WGS84_3D).transform(x, y)
+    if not (math.isfinite(longitude) and math.isfinite(latitude)):
+        raise AerialDataError(
+            f"the coordinates ({x:.7g}, {y:.7g}) do not fit the CRS {crs_name(crs)}; give it with --crs"
+        )
+    return utm_crs_for(longitude, latitude)
+
+
+def same_crs(first: str, second: str) -> bool:
+    """Say whether two texts name the same CRS."""
+    return first == second or bool(parse_crs(first).equals(parse_crs(second), ignore_axis_order=True))
+
+
+def metres_per_unit(crs: str, y: float) -> tuple[float, float]:
+    """Return about how many metres one unit of x and of y are at the ordinate (or latitude) `y`."""
+    horizontal = _horizontal(parse_crs(crs))
+    if horizontal.is_geographic:
+        return 111_320.0 * max(math.cos(math.radians(min(abs(y), 89.0))), 0.01), 111_320.0
+    unit = float(horizontal.axis_info[0].unit_conversion_factor)
+    return unit, unit
+
+
 @dataclass(frozen=True)
 class VerticalReference:
     """What a survey's heights are measured from, and in which unit."""

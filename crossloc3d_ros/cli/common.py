@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from typing import Any, Literal, TypeVar
 
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from crossloc3d_ros.config import from_dict
 from crossloc3d_ros.errors import CrossLocError
@@ -78,6 +80,55 @@ def set_up_logging(verbosity: int, target: Console | None = None) -> None:
     logger.handlers[:] = [handler]
     logger.setLevel(logging.DEBUG if verbosity else logging.INFO)
     logger.propagate = False
+
+
+class ProgressDisplay:
+    """Show how far a long command is: a bar with rate and end time, or a line now and then where nobody watches.
+
+    Use it as a context manager and call it with what is being done, how much is done of how much, and the unit.
+    """
+
+    def __init__(self, target: Console, *, line_every_s: float = 5.0) -> None:
+        self._console = target
+        self._line_every_s = line_every_s
+        self._bar: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._started: dict[str, tuple[float, float]] = {}
+        self._last_line_s = 0.0
+        if target.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description:<9}"),
+                BarColumn(bar_width=None),
+                TextColumn("{task.percentage:>3.0f}%"),
+                TextColumn("{task.fields[rate]}"),
+                TimeRemainingColumn(elapsed_when_finished=True),
+                console=target,
+            )
+
+    def __enter__(self) -> ProgressDisplay:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, stage: str, done: float, total: float, unit: str) -> None:
+        """Show that `done` of `total` units of a stage are done."""
+        now = time.monotonic()
+        # What an earlier run did counts as done but not towards the rate.
+        begun_s, begun = self._started.setdefault(stage, (now, done))
+        rate = (done - begun) / (now - begun_s) if now > begun_s else 0.0
+        text = f"{done:,.0f} of {total:,.0f} {unit}" + (f", {rate:,.3g} a second" if rate > 0 else "")
+        if self._bar is not None:
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bar.add_task(stage, total=total, rate="")
+            self._bar.update(self._tasks[stage], completed=done, rate=text)
+        elif done >= total or now - self._last_line_s >= self._line_every_s:
+            left = f", {(total - done) / rate:,.0f} s left" if rate > 0 and done < total else ""
+            self._console.print(f"{stage}: {text}{left}")
+            self._last_line_s = now
 
 
 def add_verbosity(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,114 @@
+"""`build_map`: make an aerial map out of LAS, LAZ and COPC files."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+from crossloc3d_ros.cli.common import (
+    ProgressDisplay,
+    add_options,
+    add_verbosity,
+    console,
+    read_options,
+    run,
+    set_up_logging,
+)
+from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.encoder.checkpoint import load_encoder
+from crossloc3d_ros.places.builder import BuildReport, build_map
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    arguments = _parser().parse_args(argv)
+    return run(lambda: _build(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="build_map",
+        description="Build an aerial map that a robot can be localized in. An interrupted build goes on where it "
+        "stopped when the same command is given again.",
+    )
+    parser.add_argument("files", nargs="+", help="LAS, LAZ or COPC files, folders with such files, globs")
+    parser.add_argument("--output", required=True, type=Path, help="the map's folder, such as maps/town")
+    parser.add_argument("--crs", help="CRS of the files, instead of what they say, such as EPSG:28992")
+    parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
+    parser.add_argument("--device", default="cpu", help="where to encode: cpu or cuda (default: %(default)s)")
+    parser.add_argument("--scheduler", help="address of a Dask cluster that sees the same folders, tcp://host:8786")
+    parser.add_argument("--overwrite", action="store_true", help="replace the map if there is one")
+    parser.add_argument(
+        "--geoid-separation", type=float, metavar="METRES",
+        help="ellipsoidal height minus the survey's height; without it fixes carry no altitude",
+    )  # fmt: skip
+    add_options(parser, BuildConfig)
+    add_verbosity(parser)
+    return parser
+
+
+def _build(arguments: argparse.Namespace) -> None:
+    config = read_options(BuildConfig, arguments)
+    target = console()
+    set_up_logging(arguments.verbose, target)
+    one_thread_each = config.workers > 1 or arguments.scheduler is not None
+    loader = functools.partial(
+        load_encoder, arguments.weights, device=arguments.device, threads=1 if one_thread_each else None
+    )
+    with ProgressDisplay(target) as display:
+        report = build_map(
+            arguments.files,
+            arguments.output,
+            loader,
+            config,
+            crs=arguments.crs,
+            geoid_separation_m=arguments.geoid_separation,
+            scheduler=arguments.scheduler,
+            overwrite=arguments.overwrite,
+            progress=lambda p: display(p.stage, p.done, p.total, p.unit),
+        )
+    print(summary(report))
+
+
+def summary(report: BuildReport) -> str:
+    """Return what a build came to, for people."""
+    manifest, counts = report.manifest, report.manifest.counts
+    west, south, east, north = manifest.bounds
+    ground = {
+        "classes": "class 2 of the files",
+        "filter": "own filter, because the files have no ground class",
+        "classes and filter": "class 2 of the files where they have it, own filter elsewhere",
+    }[manifest.ground]
+    left_out = counts.submaps_with_too_few_points
+    dropped = counts.points_noise + counts.points_withheld + counts.points_stray
+    rows = [
+        ("map", f"{report.output}{' (an earlier build was continued)' if report.resumed else ''}"),
+        ("area", f"{(east - west) / 1e3:.2f} x {(north - south) / 1e3:.2f} km, {manifest.crs}"),
+        ("points", f"{counts.points_used:,} used, {dropped:,} dropped (noise, withheld, stray)"),
+        ("ground", ground),
+        ("heights", _heights(report)),
+        (
+            "submaps",
+            f"{counts.submaps:,} every {manifest.build.spacing_m:g} m; {left_out:,} left out for lack of points",
+        ),
+        ("reading", f"{report.points_read:,} points in {report.reading_s:.1f} s, {report.points_per_s:,.0f} a second"),
+        (
+            "encoding",
+            f"{report.places_encoded:,} submaps in {report.encoding_s:.1f} s, {report.submaps_per_s:,.1f} a second",
+        ),
+        ("writing", f"{report.writing_s:.1f} s"),
+    ]
+    return "\n".join(f"{name:<9} {text}" for name, text in rows)
+
+
+def _heights(report: BuildReport) -> str:
+    manifest = report.manifest
+    if manifest.geoid_separation_m is None:
+        return f"above {manifest.vertical_reference} datum; no altitude in fixes without --geoid-separation"
+    return f"above {manifest.vertical_reference} datum, {manifest.geoid_separation_m:+.2f} m to the ellipsoid"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,255 @@
+"""Where the work is done: in this process, in several on this machine, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from crossloc3d_ros.errors import ConfigError, CrossLocError
+from crossloc3d_ros.types import DescriptorEncoder
+
+EncoderLoader = Callable[[], DescriptorEncoder]
+"""Loads the encoder where it is needed; a picklable function, such as `functools.partial(load_encoder, path)`."""
+
+Advance = Callable[[int], None]
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
+
+
+class Workers(Protocol):
+    """Does tasks somewhere, in any order."""
+
+    shared_threads: bool
+    """Whether a task may use every core of its machine."""
+
+    def run(
+        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+    ) -> Iterator[Result]:
+        """Yield the results as they come; tasks come with their sizes, of which `advance` is told."""
+
+    def run_encoding(
+        self,
+        function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
+        tasks: Sequence[tuple[Task, int]],
+        advance: Advance,
+    ) -> Iterator[Result]:
+        """Do the same with a function that needs the encoder."""
+
+
+class LocalWorker:
+    """Works in this process, one task after the other."""
+
+    shared_threads = True
+
+    def __init__(self, encoder: DescriptorEncoder) -> None:
+        self._encoder = encoder
+
+    def run(
+        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+    ) -> Iterator[Result]:
+        """Yield the results in the order of the tasks."""
+        for task, _ in tasks:
+            yield function(task, advance)
+
+    def run_encoding(
+        self,
+        function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
+        tasks: Sequence[tuple[Task, int]],
+        advance: Advance,
+    ) -> Iterator[Result]:
+        """Yield the results in the order of the tasks."""
+        for task, _ in tasks:
+            yield function(task, self._encoder, advance)
+
+
+class RemoteWorkers(ABC):
+    """Works in other processes, each on one core; the largest tasks are started first."""
+
+    shared_threads = False
+
+    def __init__(self, loader: EncoderLoader) -> None:
+        try:
+            self._pickled_loader = pickle.dumps(loader)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ConfigError(
+                "other processes cannot be given this encoder; hand over a function that loads it, such as "
+                "functools.partial(load_encoder, path)"
+            ) from error
+
+    def run(
+        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+    ) -> Iterator[Result]:
+        """Yield the results as they come."""
+        return self._run(functools.partial(_call, function), tasks, advance)
+
+    def run_encoding(
+        self,
+        function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
+        tasks: Sequence[tuple[Task, int]],
+        advance: Advance,
+    ) -> Iterator[Result]:
+        """Yield the results as they come."""
+        return self._run(functools.partial(_call_encoding, function, self._pickled_loader), tasks, advance)
+
+    def _run(self, function: Callable[[Any], Any], tasks: Sequence[tuple[Any, int]], advance: Advance) -> Iterator[Any]:
+        largest_first = sorted(tasks, key=lambda item: -item[1])
+        sizes = [size for _, size in largest_first]
+        for index, result in self._map(function, [task for task, _ in largest_first]):
+            yield result
+            advance(sizes[index])
+
+    @abstractmethod
+    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        """Yield (index of the task, result) as the results come."""
+
+
+class ProcessWorkers(RemoteWorkers):
+    """Works in several processes of this machine."""
+
+    def __init__(self, executor: ProcessPoolExecutor, loader: EncoderLoader) -> None:
+        super().__init__(loader)
+        self._executor = executor
+
+    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        indices = {self._executor.submit(function, task): index for index, task in enumerate(tasks)}
+        try:
+            for future in as_completed(indices):
+                yield indices[future], future.result()
+        except BrokenProcessPool as error:
+            raise CrossLocError(
+                "a worker process died, probably for lack of memory; what is done is kept: give the same command "
+                "again, with fewer --workers or smaller tiles"
+            ) from error
+
+
+class DaskWorkers(RemoteWorkers):
+    """Works on the machines of a Dask cluster that see the same folders as this one."""
+
+    def __init__(self, client: Any, loader: EncoderLoader) -> None:
+        super().__init__(loader)
+        self._client = client
+
+    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        from distributed import as_completed as dask_as_completed
+
+        futures = self._client.map(function, list(tasks), pure=False)
+        indices = {future.key: index for index, future in enumerate(futures)}
+        try:
+            for future in dask_as_completed(futures):
+                yield indices[future.key], future.result()
+        finally:
+            self._client.cancel(futures)
+
+
+@contextmanager
+def open_workers(
+    loader: EncoderLoader, encoder: DescriptorEncoder, workers: int, scheduler: str | None, folder: Path
+) -> Iterator[Workers]:
+    """Give the workers that were asked for; `folder` is where the work lies, and all of them must see it.
+
+    Raises ConfigError where the cluster does not answer or does not see the folder.
+    """
+    if scheduler is not None:
+        with _dask_client(scheduler, folder) as client:
+            yield DaskWorkers(client, loader)
+    elif workers > 1:
+        with _process_pool(workers) as executor:
+            yield ProcessWorkers(executor, loader)
+    else:
+        yield LocalWorker(encoder)
+
+
+@contextmanager
+def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    context = multiprocessing.get_context("spawn")  # a forked torch or numba may hang on a lock that a thread held
+    receiver, sender = context.Pipe(duplex=False)
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))  # read by the libraries when a worker imports them
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(receiver,))
+    try:
+        yield executor
+        executor.shutdown()
+    finally:
+        sender.close()  # whatever still runs ends now: its result would only be done again
+        executor.shutdown(cancel_futures=True)
+        receiver.close()
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _start_worker(parent: Connection) -> None:
+    """Leave Ctrl-C to the parent, and end when the parent closes the pipe or dies in whatever way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def watch() -> None:
+        try:
+            parent.recv()
+        except (EOFError, OSError):
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _dask_client(scheduler: str, folder: Path) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigError("--scheduler needs Dask: pip install distributed") from error
+    try:
+        client = Client(scheduler, timeout=10, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ConfigError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+    try:
+        seen = client.run(folder.is_dir)
+        if not seen:
+            raise ConfigError(f"the Dask scheduler at {scheduler} has no workers")
+        blind = [address for address, sees in seen.items() if not sees]
+        if blind:
+            raise ConfigError(
+                f"the Dask workers {', '.join(sorted(blind))} do not see {folder}: inputs and output must lie on a "
+                "disk that every machine shares, under the same path"
+            )
+        yield client
+    finally:
+        client.close()
+
+
+def _call(function: Callable[[Any, None], Any], task: Any) -> Any:
+    return function(task, None)
+
+
+def _call_encoding(function: Callable[[Any, DescriptorEncoder, None], Any], pickled_loader: bytes, task: Any) -> Any:
+    return function(task, _load_once(pickled_loader), None)
+
+
+_loading = threading.Lock()
+
+
+def _load_once(pickled_loader: bytes) -> DescriptorEncoder:
+    with _loading:  # a Dask worker has threads
+        return _load(pickled_loader)
+
+
+@functools.lru_cache(maxsize=1)
+def _load(pickled_loader: bytes) -> DescriptorEncoder:
+    loader: EncoderLoader = pickle.loads(pickled_loader)
+    return loader()
