@@ -254,7 +254,7 @@ def _monument(plan: Plan, rect: Rect, rng: Generator) -> None:
         return
     eave = rng.uniform(12, 19)
     owner = _composite(plan, inner, rng, "court" if rng.random() < 0.6 else "u", rng.uniform(9, 14), eave, 0.25, 5.0)
-    u, v = inner.centre
+    u = inner.centre[0]
     plan.wing(owner, Rect(u - 6, inner.v0 - 1, u + 6, inner.v0 + 11), eave + rng.uniform(3, 7), eave + 10, hip=0.5)
 
 
@@ -384,8 +384,12 @@ def _slabs(plan: Plan, rect: Rect, rng: Generator) -> None:
         if length < 15:
             continue
         top = height * rng.choice([1.0, 1.0, 1.0, 0.7])
-        body = (Rect(inner.u0 + start, inner.v0 + near, inner.u0 + start + length, inner.v0 + near + depth) if along_u
-                else Rect(inner.u0 + near, inner.v0 + start, inner.u0 + near + depth, inner.v0 + start + length))  # fmt: skip
+        body = (
+            Rect(start, near, start + length, near + depth)
+            if along_u
+            else Rect(near, start, near + depth, start + length)
+        )
+        body = body.shifted(inner.u0, inner.v0)
         owner = plan.owner(*body.centre)
         plan.wing(owner, body, top, top + roof, along_u=along_u)
         if bays:
@@ -435,8 +439,10 @@ def _detached(plan: Plan, rect: Rect, rng: Generator) -> None:
         while position < long_side - 0.6 * parcel:
             front = min(parcel * rng.uniform(0.8, 1.3), long_side - position)
             low, high = (row * short_side / rows, (row + 1) * short_side / rows)
-            lot = (Rect(rect.u0 + position, rect.v0 + low, rect.u0 + position + front, rect.v0 + high) if along_u
-                   else Rect(rect.u0 + low, rect.v0 + position, rect.u0 + high, rect.v0 + position + front))  # fmt: skip
+            lot = (
+                Rect(position, low, position + front, high) if along_u else Rect(low, position, high, position + front)
+            )
+            lot = lot.shifted(rect.u0, rect.v0)
             position += front
             _single_house(plan, lot, rng, along_u, row == 0, setback)
             for _ in range(rng.poisson(green)):
@@ -627,15 +633,23 @@ def _parking_rows(plan: Plan, rect: Rect, rng: Generator, *, chance: float, cert
         plan.cars.append((u, v, np.pi / 2, chance, rng.random()))
 
 
+def _draw_canal(plan: Plan, street: Street, half_width: float, rng: Generator) -> None:
+    """Draw the water of a canal between its quays, with a bridge every block or so."""
+    start = 0.0
+    while start < street.length:
+        end = min(start + rng.uniform(45.0, 90.0), street.length)
+        (u0, v0), (u1, v1) = street.at(start, -half_width), street.at(end, half_width)
+        plan.water.append(Rect(min(u0, u1), min(v0, v1), max(u0, u1), max(v0, v1)))
+        start = end + rng.uniform(7.0, 12.0)
+
+
 def draw_street(plan: Plan, street: Street, family: Family, rng: Generator) -> None:
     """Draw what lines a street: canal, trees, parked cars, lamps, signs."""
     half = street.width / 2
     canal = street.level < 3 and street.width > 15 and rng.random() < family.canals
+    bank = float(rng.uniform(4.5, 6.5)) if canal else 0.0
     if canal:
-        bank = rng.uniform(4.5, 6.5)
-        u0, v0 = street.at(0, -(half - bank))
-        u1, v1 = street.at(street.length, half - bank)
-        plan.water.append(Rect(min(u0, u1), min(v0, v1), max(u0, u1), max(v0, v1)))
+        _draw_canal(plan, street, half - bank, rng)
     plan.pedestrians.append(street.rect)
     trees = rng.random() < family.street_trees and street.width > 9
     if trees or (canal and rng.random() < 0.7):
@@ -658,12 +672,12 @@ def draw_street(plan: Plan, street: Street, family: Family, rng: Generator) -> N
             across_lane = rng.choice([-1, 1]) * 0.2 * street.width
             if not canal:
                 plan.cars.append((*street.at(along, across_lane), street.yaw_rad, 0.12, rng.random()))
-    side = float(rng.choice([-1, 1]))
+    lit = float(rng.choice([-1, 1]))
     height, spacing = rng.uniform(4.5, 9.5), rng.uniform(22, 38)
     for along in np.arange(rng.uniform(2, spacing), street.length, spacing):
-        plan.poles.append((*street.at(along, side * (half - 0.6)), height, 0.12, 0.08, float(Label.STRUCTURE)))
+        plan.poles.append((*street.at(along, lit * (half - 0.6)), height, 0.12, 0.08, float(Label.STRUCTURE)))
     for along in np.arange(rng.uniform(5, 40), street.length, rng.uniform(25, 60)):
-        place = street.at(along, -side * (half - 0.5))
+        place = street.at(along, -lit * (half - 0.5))
         if rng.random() < 0.8:
             plan.poles.append((*place, rng.uniform(0.9, 3.2), 0.05, 0.3, float(Label.STRUCTURE)))
         else:

@@ -43,6 +43,10 @@ class Rect(NamedTuple):
         """Return the rectangle drawn in by `by` metres on every side."""
         return Rect(self.u0 + by, self.v0 + by, self.u1 - by, self.v1 - by)
 
+    def shifted(self, u: float, v: float) -> Rect:
+        """Return the rectangle moved by (u, v)."""
+        return Rect(self.u0 + u, self.v0 + v, self.u1 + u, self.v1 + v)
+
 
 class Street(NamedTuple):
     """A strip between blocks, along u or along v."""
@@ -72,12 +76,18 @@ class Street(NamedTuple):
         return 0.0 if self.along_u else float(np.pi / 2)
 
 
+_WARP_RADIUS_M = 480.0
+"""Where a polynomial warp has its full strength."""
+
+
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Plan (u, v) to local (x, y): waves, a shear, a turn; smooth and without folds."""
+    """Plan (u, v) to local (x, y): waves, a conformal bend, a turn and a shear; smooth and without folds."""
 
     waves: Float64Array
-    """(W, 6) wave vector u, v [rad/m]; phase; displacement u, v [m]; unused."""
+    """(W, 5) wave vector u, v [rad/m]; phase; displacement u, v [m]."""
+    bend: npt.NDArray[np.complex128]
+    """(B,) the derivative is 1 + sum bend[i] (z / radius)^(i + 1): right angles stay right where streets turn."""
     linear: Float64Array
     """(2, 2) turn and shear."""
 
@@ -85,11 +95,16 @@ class Warp:
         """Return local positions (..., 2) of plan positions (..., 2)."""
         flat = np.asarray(uv, dtype=np.float64)
         moved = flat.copy()
-        for ku, kv, phase, du, dv, _ in self.waves:
+        for ku, kv, phase, du, dv in self.waves:
             wave = np.sin(flat[..., 0] * ku + flat[..., 1] * kv + phase)
             moved[..., 0] += du * wave
             moved[..., 1] += dv * wave
-        return moved @ self.linear.T
+        z = moved[..., 0] + 1j * moved[..., 1]
+        bent, power = z.copy(), z.copy()
+        for i, strength in enumerate(self.bend):
+            power = power * z / _WARP_RADIUS_M
+            bent = bent + strength * power / (i + 2)
+        return np.asarray(np.stack([bent.real, bent.imag], -1) @ self.linear.T, dtype=np.float64)
 
     def yaw(self, uv: Float64Array, yaw_plan: Float64Array) -> Float64Array:
         """Return the local heading (N,) of a plan heading at plan positions (N, 2)."""
@@ -99,11 +114,11 @@ class Warp:
 
 
 def draw_warp(layout: Layout, rng: np.random.Generator) -> Warp:
-    """Return a warp in the manner of `layout`; its local stretch stays under about a third."""
-    bands = {
-        "grid": [(500.0, 900.0, 0.06, 1)],
-        "irregular": [(350.0, 700.0, 0.16, 2), (110.0, 200.0, 0.07, 2)],
-        "curved": [(280.0, 600.0, 0.30, 2), (150.0, 260.0, 0.06, 1)],
+    """Return a warp in the manner of `layout`; lengths change by less than two thirds within 500 m of the middle."""
+    bands, bends = {
+        "grid": ([(500.0, 900.0, 0.05, 1)], (0.0, 0.0, 0.0)),
+        "irregular": ([(300.0, 650.0, 0.2, 2), (120.0, 220.0, 0.14, 2)], (0.2, 0.15, 0.1)),
+        "curved": ([(200.0, 400.0, 0.08, 1)], (0.3, 0.3, 0.15)),
     }[layout]
     waves = []
     for low, high, slope, count in bands:
@@ -112,11 +127,14 @@ def draw_warp(layout: Layout, rng: np.random.Generator) -> Warp:
             number = 2 * np.pi / wavelength
             amplitude = slope / number * rng.uniform(0.6, 1.0) / np.sqrt(count)
             waves.append([number * np.cos(direction), number * np.sin(direction), rng.uniform(0, 2 * np.pi),
-                          amplitude * np.cos(push), amplitude * np.sin(push), 0.0])  # fmt: skip
+                          amplitude * np.cos(push), amplitude * np.sin(push)])  # fmt: skip
+    angles = rng.uniform(0, 2 * np.pi, len(bends))
+    strengths = np.array(bends) * rng.uniform(0.5, 1.0, len(bends))
     turn = rng.uniform(0, 2 * np.pi)
-    shear = rng.uniform(-0.25, 0.25) if layout != "grid" else rng.uniform(-0.08, 0.08)
+    shear = rng.uniform(-0.12, 0.12) if layout != "grid" else rng.uniform(-0.06, 0.06)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return Warp(np.array(waves), rotation @ np.array([[1.0, shear], [0.0, 1.0]]))
+    linear = rotation @ np.array([[1.0, shear], [0.0, 1.0]])
+    return Warp(np.array(waves), strengths * (np.cos(angles) + 1j * np.sin(angles)), linear)
 
 
 def draw_streets(

@@ -78,7 +78,7 @@ def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch
     style = FAMILIES[family]
     layout: Layout = style.layouts[int(rng.integers(len(style.layouts)))]
     warp = draw_warp(layout, rng)
-    plan, open_ground = _draw_plan(style, warp, layout, reach, rng)
+    plan, blocks, avenue = _draw_plan(style, warp, layout, reach, rng)
     relief = _Relief.draw(_generator(seed, 2), flat=family in ("old_town", "industry"))
     parts = _Parts.of(plan, warp, relief, reach, seed, epoch)
 
@@ -98,8 +98,10 @@ def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch
     obstacles[trunk_row, trunk_column] = True
 
     blocked = np.zeros_like(obstacles)
-    _fill_quads(blocked, open_ground, -reach, reach, _FREE_CELL_M, 0.0)
-    clearance, preference = free_space(obstacles, ~blocked, -reach, reach, _FREE_CELL_M)
+    _fill_quads(blocked, blocks, -reach, reach, _FREE_CELL_M, 0.0)
+    cleared = np.zeros_like(obstacles)
+    _fill_quads(cleared, avenue, -reach, reach, _FREE_CELL_M, 0.0)
+    clearance, preference = free_space(obstacles, ~blocked | cleared, -reach, reach, _FREE_CELL_M)
 
     terrain = relief.raster(reach + _TERRAIN_CELL_M)
     scene = mesh.scene_from([_ground(relief, reach, parts.water), *parts.meshes(relief, seed, epoch)])
@@ -118,8 +120,8 @@ def _generator(seed: int, *purpose: int) -> np.random.Generator:
 
 def _draw_plan(
     style: Family, warp: Warp, layout: Layout, reach: float, rng: np.random.Generator
-) -> tuple[Plan, Float64Array]:
-    """Return the plan and the local quads (K, 4, 2) of the blocks that are not open ground."""
+) -> tuple[Plan, Float64Array, Float64Array]:
+    """Return the plan, the local quads (K, 4, 2) of the blocks that are not open ground, and those of an avenue."""
     extent = 1.5 * reach
     jitter = style.jitter * (0.4 if layout == "grid" else 1.0)
     blocks, streets = draw_streets(Rect(-extent, -extent, extent, extent), style.block_m, style.street_m, jitter, rng)
@@ -142,10 +144,10 @@ def _draw_plan(
             closed.append(warp(_patches(block)))
     for street in streets:
         draw_street(plan, street, style, np.random.Generator(np.random.PCG64(rng.integers(2**63))))
+    avenue = np.zeros((0, 4, 2))
     if rng.random() < (0.3 if layout == "grid" else 0.55):
-        _cut_avenue(plan, extent, rng)
-    open_ground = np.concatenate(closed) if closed else np.zeros((0, 4, 2))
-    return plan, open_ground
+        avenue = warp(_cut_avenue(plan, extent, rng))
+    return plan, np.concatenate(closed) if closed else np.zeros((0, 4, 2)), avenue
 
 
 def _patches(block: Rect, pieces: int = 4) -> Float64Array:
@@ -159,15 +161,15 @@ def _patches(block: Rect, pieces: int = 4) -> Float64Array:
     return np.array(quads)
 
 
-def _cut_avenue(plan: Plan, extent: float, rng: np.random.Generator) -> None:
-    """Clear a straight strip across the plan, slantwise to its streets, and line it with trees."""
+def _cut_avenue(plan: Plan, extent: float, rng: np.random.Generator) -> Float64Array:
+    """Clear a strip across the plan, slantwise to its streets, line it with trees, and return it (K, 4, 2)."""
     angle = rng.choice([-1, 1]) * rng.uniform(0.35, 1.2)
     direction = np.array([np.cos(angle), np.sin(angle)])
     normal = np.array([-direction[1], direction[0]])
     offset, width = rng.uniform(-0.35, 0.35) * extent, rng.uniform(12.0, 26.0)
 
     def away(uv: npt.NDArray[np.floating]) -> Float64Array:
-        return np.abs(uv @ normal - offset)
+        return np.asarray(np.abs(uv @ normal - offset), dtype=np.float64)
 
     if plan.wings:
         rows = np.array(plan.wings)
@@ -187,6 +189,9 @@ def _cut_avenue(plan: Plan, extent: float, rng: np.random.Generator) -> None:
                 plan.tree(u, v, rng, height=(0.85 * tall, 1.1 * tall), kinds=(0.95, 0, 0.05, 0))
             u, v = direction * (along + spacing / 2) + normal * (offset + side * (width / 2 - 2.6))
             plan.cars.append((u, v, angle, occupied, rng.random()))
+    steps = np.arange(-1.4 * extent, 1.4 * extent, 20.0)
+    middles = steps[:, None] * direction + offset * normal
+    return mesh.oriented_boxes(middles, 20.0, width, np.full(len(steps), angle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +213,7 @@ class _Relief:
         return _Relief(np.array(waves))
 
     def __call__(self, xy: npt.NDArray[np.floating]) -> Float64Array:
-        height = np.zeros(xy.shape[:-1])
+        height: Float64Array = np.zeros(xy.shape[:-1])
         for kx, ky, phase, amplitude in self.waves:
             height += amplitude * np.sin(xy[..., 0] * kx + xy[..., 1] * ky + phase)
         return height

@@ -35,7 +35,7 @@ class Vlp16Config:
     min_range_m: float = option(0.5, "nearer echoes are dropped", low=0.0, high=5.0)
     max_range_m: float = option(100.0, "farther echoes are dropped", low=1.0, high=200.0)
     range_error_m: float = option(0.02, "one sigma of a range", low=0.0, high=1.0)
-    echo_limit: float = option(1.5e-5, "weakest reflectivity * cos(incidence) / range^2 that comes back", low=0.0)
+    echo_limit: float = option(1.5e-5, "weakest reflectivity * cos(incidence)^0.75 / range^2 that comes back", low=0.0)
     random_dropout: float = option(0.003, "share of echoes lost for no reason", low=0.0, high=1.0)
     body: tuple[float, ...] = option(
         (-0.42, -0.05, -0.6, -0.32, 0.05, 0.45, -0.9, -0.45, -1.0, 0.6, 0.45, -0.55),
@@ -142,7 +142,8 @@ def _echoes(
 ) -> BoolArray:
     """Return which beams come back strongly enough."""
     inside = (distance > config.min_range_m) & (distance < config.max_range_m)
-    strength = reflectivity * cosine / np.maximum(distance, np.float32(0.1)) ** 2
+    # Asphalt and grass are rough: at grazing incidence they send back more than Lambert's cosine.
+    strength = reflectivity * cosine**0.75 / np.maximum(distance, np.float32(0.1)) ** 2
     draw = rng.random(len(distance), dtype=np.float32)
     # The limit is not sharp: the same wall flickers over a factor of two.
     kept = inside & (strength > config.echo_limit * (0.7 + 0.8 * draw))

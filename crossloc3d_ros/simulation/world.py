@@ -116,7 +116,7 @@ def free_space(
 ) -> tuple[Raster, Raster]:
     """Return clearance and preference from masks of cells (row 0 = north).
 
-    What cannot be reached from the roads with a metre on either side is not preferred at all: closed courtyards.
+    What hangs together with no road, keeping a metre on either side, is not preferred at all: closed courtyards.
     """
     padded = np.pad(obstacles, 1, constant_values=True)
     distance = ndimage.distance_transform_edt(~padded)[1:-1, 1:-1] * cell_m
@@ -131,7 +131,8 @@ def free_space(
         if votes.max() == 0:
             votes = np.bincount(regions.ravel(), minlength=count + 1)
             votes[0] = 0
-        reachable = regions == int(np.argmax(votes))
+        # Quarters on either side of a river are both real places; a strip between two fences is none.
+        reachable = (votes >= max(1.0, 0.05 * votes.max()))[regions]
         preference[reachable] = 0.2
         preference[reachable & roads] = 1.0
     return (
