@@ -10,7 +10,7 @@ from numba import njit
 from scipy import ndimage
 
 from crossloc3d_ros.clouds.filters import check_points
-from crossloc3d_ros.clouds.raster import fill_holes
+from crossloc3d_ros.clouds.raster import Raster, fill_holes, surface_raster
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 
@@ -20,6 +20,7 @@ _CELL_M = 2.0
 _STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, never the road
 _STEP_M = 0.25  # and so is a step higher than this
 _CONE_M = 1.0  # what lies deeper than the steepest road would lead, and this much more, is a reflection
+_FARTHEST_M = 150.0  # no sensor on a robot sees the ground beyond
 _LEVELS = 3  # the membrane is stretched over cells of 8, 4 and 2 m
 _SWEEPS = 12
 
@@ -38,6 +39,7 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
     check_points(points_base, "points_base")
     if not (math.isfinite(sensor_height_m) and math.isfinite(reach_m) and reach_m > 0):
         raise CloudError(f"sensor_height_m and reach_m must be finite, got {sensor_height_m} and {reach_m}")
+    reach_m = min(reach_m, _FARTHEST_M)
     points = np.ascontiguousarray(points_base, dtype=np.float32)
     step = 1 << (_LEVELS - 1)
     cells = 2 * step * math.ceil(reach_m / _CELL_M / step)  # every level halves it evenly
@@ -114,7 +116,9 @@ def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array):  # 
         row, column = min(int((y + half) * inverse), cells - 1), min(int((x + half) * inverse), cells - 1)
         cell_of[i] = row * cells + column
         over[i] = z - (a * x + b * y + c)
-        if over[i] < lowest[row, column]:
+        held = lowest[row, column]
+        first = x < where[row, column, 0] or (x == where[row, column, 0] and y < where[row, column, 1])
+        if over[i] < held or (over[i] == held and first):  # whatever the order of the points
             lowest[row, column] = over[i]
             where[row, column, 0] = x
             where[row, column, 1] = y
@@ -325,21 +329,26 @@ def _heights_above(points: Float32Array, plane: Float64Array, ground: Float32Arr
 # --- the ground in an aerial survey -------------------------------------------------------------------------------
 
 
+_TREND_M = 20.0  # smoothing of the terrain that the second pass takes away
+_NOISE_M = 0.3  # an opening always lowers rough ground by this much
+
+
 def classify_ground(
     points: Float64Array,
     cell_m: float = 1.0,
     *,
-    slope: float = 0.15,
+    slope: float = 0.1,
     largest_window_m: float = 40.0,
-    tolerance_m: float = 0.4,
+    tolerance_m: float = 0.3,
 ) -> BoolArray:
     """Return the mask (N,) of ground points in an aerial survey that carries no classes.
 
-    Points (N, 3) easting, northing, height, metres. A progressive morphological filter in the manner of Zhang et al.
-    (2003) and SMRF (Pingel et al. 2013): openings of the lowest-point raster with windows that grow up to
-    `largest_window_m`, which must exceed half the width of the widest building; what an opening lowers by more than
-    `slope` times the window is an object. A point is ground within `tolerance_m` of the terrain that is left, plus
-    what the terrain's own steepness adds.
+    Points (N, 3) easting, northing, height, metres. A progressive morphological filter after Zhang et al. (2003) and
+    SMRF (Pingel et al. 2013): openings of the lowest-point raster with windows that grow up to `largest_window_m`
+    either way, which must exceed half the width of the widest building. What one opening lowers by more than `slope`
+    times its window, or all so far by half as much again, is an object. A second pass sees the raster less the smooth
+    terrain that the first one found, so that hills and hillsides do not count as slope. A point is ground within
+    `tolerance_m` of the terrain that is left, plus what the terrain's own steepness adds within a cell.
     """
     check_points(points)
     if not (cell_m > 0 and slope > 0 and largest_window_m > 0 and tolerance_m > 0):
@@ -348,44 +357,49 @@ def classify_ground(
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         return mask
-    e, n, z = points[finite].T
-    west, south = e.min(), n.min()
-    columns = ((e - west) / cell_m).astype(np.int64)
-    rows = ((n - south) / cell_m).astype(np.int64)
-    shape = (int(rows.max()) + 1, int(columns.max()) + 1)
-    lowest = np.full(shape, np.inf)
-    np.minimum.at(lowest, (rows, columns), z)
-    raster = np.where(np.isfinite(lowest), lowest, np.nan)
-    raster[_is_pit(raster, cell_m)] = np.nan
-    surface = fill_holes(raster.astype(np.float32)).astype(np.float64)
-
-    is_object = np.zeros(shape, np.bool_)
-    opened = surface
-    for radius in _radii(largest_window_m / cell_m):
-        size = 2 * radius + 1
-        lower = ndimage.grey_opening(opened, size=(size, size))
-        is_object |= opened - lower > slope * radius * cell_m
-        opened = lower
-    terrain = fill_holes(np.where(is_object | np.isnan(raster), np.nan, surface).astype(np.float32)).astype(np.float64)
-    steepness = np.hypot(*np.gradient(terrain, cell_m)) if min(shape) > 1 else np.zeros(shape)
-    at = np.stack([(n - south) / cell_m - 0.5, (e - west) / cell_m - 0.5])
-    below = ndimage.map_coordinates(terrain, at, order=1, mode="nearest")
-    steep = ndimage.map_coordinates(steepness, at, order=1, mode="nearest")
+    easting, northing, z = np.asarray(points, np.float64)[finite].T
+    # A rim of one cell keeps points on the upper edges inside.
+    bounds = (easting.min(), northing.min(), easting.max() + cell_m, northing.max() + cell_m)
+    lowest = -surface_raster(np.column_stack([easting, northing, -z]), bounds, cell_m).values.astype(np.float64)
+    lowest[_is_pit(lowest, cell_m)] = np.nan
+    holes = np.isnan(lowest)
+    surface = _filled(lowest)
+    trend = np.zeros_like(surface)
+    for _ in range(2):
+        objects = _objects(surface - trend, slope, cell_m, largest_window_m)
+        terrain = _filled(np.where(objects | holes, np.nan, surface))
+        trend = ndimage.gaussian_filter(terrain, _TREND_M / cell_m, mode="nearest")
+    steepness = np.hypot(*np.gradient(terrain, cell_m)) if min(terrain.shape) > 1 else np.zeros_like(terrain)
+    below = Raster(terrain.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
+    steep = Raster(steepness.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
     mask[finite] = np.abs(z - below) <= tolerance_m + 0.5 * steep * cell_m
     return mask
 
 
-def _radii(largest: float) -> list[int]:
-    """Return growing window radii in cells: every one at first, then in steps of a fifth."""
-    radii = [1]
-    while radii[-1] < largest:
-        radii.append(max(radii[-1] + 1, int(radii[-1] * 1.2)))
-    return radii
+def _objects(surface: Float64Array, slope: float, cell_m: float, largest_window_m: float) -> BoolArray:
+    """Return the cells (H, W) that growing openings of the surface lower by more than terrain would be."""
+    objects = np.zeros(surface.shape, np.bool_)
+    opened = surface
+    radius = 1
+    while True:
+        lower = ndimage.grey_opening(opened, size=(2 * radius + 1, 2 * radius + 1))
+        allowed = slope * radius * cell_m
+        objects |= opened - lower > max(_NOISE_M, allowed)
+        objects |= surface - lower > max(_NOISE_M, 1.5 * allowed)
+        opened = lower
+        if radius * cell_m >= largest_window_m or 2 * radius >= max(surface.shape):
+            return objects
+        radius = max(radius + 1, int(radius * 1.3))
+
+
+def _filled(values: Float64Array) -> Float64Array:
+    """Return the raster (H, W) without holes."""
+    return fill_holes(values.astype(np.float32)).astype(np.float64)
 
 
 def _is_pit(raster: npt.NDArray[np.float64], cell_m: float) -> BoolArray:
     """Return the cells that lie far below all their neighbours: reflections, not terrain."""
     filled = np.where(np.isfinite(raster), raster, np.inf)
     around = ndimage.minimum_filter(filled, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
-    pits: BoolArray = np.isfinite(around) & (filled < around - 5.0 * cell_m)
+    pits: BoolArray = np.isfinite(around) & (filled < around - max(5.0 * cell_m, 2.0))
     return pits

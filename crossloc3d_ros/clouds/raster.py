@@ -17,6 +17,7 @@ Bounds = tuple[float, float, float, float]
 """min easting, min northing, max easting, max northing; metres."""
 
 _RELAXATIONS = 24
+_MOST_CELLS = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,8 @@ def _shape(bounds: Bounds, cell_m: float) -> tuple[int, int]:
     min_e, min_n, max_e, max_n = bounds
     if not all(map(math.isfinite, bounds)) or not cell_m > 0 or not (max_e > min_e and max_n > min_n):
         raise CloudError(f"bounds {bounds} with cells of {cell_m} m do not span a raster")
+    if (max_n - min_n) / cell_m * ((max_e - min_e) / cell_m) > _MOST_CELLS:
+        raise CloudError(f"{max_e - min_e:.4g} x {max_n - min_n:.4g} m are too many cells of {cell_m} m: stray points?")
     # A hair's tolerance, so that 380.0000001 m in cells of 1 m stay 380 cells.
     return math.ceil((max_n - min_n) / cell_m - 1e-6), math.ceil((max_e - min_e) / cell_m - 1e-6)
 
