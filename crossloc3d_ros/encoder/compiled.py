@@ -100,7 +100,7 @@ class CompiledModel:
         self._team.share(channels, stages.aggregate, fused, soft, sums)
         y = self._project(stages.residuals(sums, soft, self._centers), self._projection)
         gate = self._project(y, self._gating)
-        return y / (np.float32(1.0) + np.exp(-gate))
+        return (y / (1.0 + np.exp(-gate))).astype(np.float32)
 
     def _project(self, x: Float32Array, layer: _Layer) -> Float32Array:
         parts = np.zeros((self._team.threads, len(layer.shift)), np.float32)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig
+from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import Float32Array
+
+MAX_THREADS = 4
+"""More threads than this gain nothing for a single cloud."""
 
 
 class Encoder:
@@ -28,7 +33,10 @@ class Encoder:
     ) -> None:
         self._model = model.eval().to(device)
         self._device = device
-        self._threads = threads
+        self._compiled = None
+        if device == "cpu" and CompiledModel.can_compile(model):
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            self._compiled = CompiledModel(model, min(cores, MAX_THREADS) if threads is None else threads)
         self._preprocessing = preprocessing
         self._fingerprint = fingerprint
         self.metadata = dict(metadata or {})
@@ -63,11 +71,15 @@ class Encoder:
         for cloud in clouds:
             if cloud.ndim != 2 or cloud.shape[1] != 3 or len(cloud) == 0:
                 raise CloudError(f"a patch must be an array (n, 3) with n > 0, got {cloud.shape}")
+        arrays = [np.ascontiguousarray(cloud, np.float32) for cloud in clouds]
+        if self._compiled is not None:
+            return np.stack([self._compiled.encode(array) for array in arrays])
         with torch.no_grad():
-            tensors = [torch.from_numpy(np.ascontiguousarray(c, np.float32)).to(self._device) for c in clouds]
+            tensors = [torch.from_numpy(array).to(self._device) for array in arrays]
             result: Float32Array = self._model(tensors).cpu().numpy()
         return result
 
     def warm_up(self) -> None:
         """Compile and touch whatever makes the first call slow."""
-        self.encode(np.zeros((16, 3), np.float32))
+        spread = np.random.default_rng(0).uniform(-1.0, 1.0, (self._preprocessing.n_points, 3))
+        self.encode(spread.astype(np.float32))

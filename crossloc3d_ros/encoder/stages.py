@@ -246,6 +246,8 @@ def select(
     logits = np.empty((BLOCK, n_branches * channels), np.float32)
     top = np.empty(channels, np.float32)
     total = np.empty(channels, np.float32)
+    above = np.empty(channels, np.float32)
+    most = np.float32(kept)
     weights = np.empty((n_branches, channels), np.float32)
     for start in range(begin, end, BLOCK):
         rows = min(BLOCK, end - start)
@@ -276,13 +278,17 @@ def select(
                     total[c] += weights[b, c]
             for c in range(channels):
                 out[start + i, c] = 0.0
+            for c in range(channels):
+                total[c] = _ONE / total[c]
             for b in range(n_branches):
                 for c in range(channels):
-                    above = 0
-                    for other in range(n_branches):
-                        above += row[other, c] > row[b, c]
-                    kept_weight = weights[b, c] if above < kept else np.float32(0.0)
-                    out[start + i, c] += kept_weight / total[c] * scaled[b, i, c]
+                    above[c] = 0.0
+                for other in range(n_branches):
+                    for c in range(channels):
+                        above[c] += np.float32(row[other, c] > row[b, c])
+                for c in range(channels):
+                    weight = weights[b, c] * total[c] if above[c] < most else np.float32(0.0)
+                    out[start + i, c] += weight * scaled[b, i, c]
 
 
 @_loose
