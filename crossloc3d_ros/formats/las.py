@@ -139,6 +139,70 @@ def iter_chunks(path: Path, chunk_points: int = 1_000_000, *, threads: bool = Tr
         raise AerialDataError(f"{path} is truncated: it holds {read:,} of {expected:,} points; fetch it again")
 
 
+class LazWriter:
+    """Writes a LAZ file chunk by chunk (LAS where the name says so), as a context manager.
+
+    `scale` is the step of the stored coordinates in the CRS's units, 1e-7 for instance for degrees; heights beside
+    degrees are stored to the millimetre. `offset` (3,) is subtracted before storing, by default the corner of the
+    first chunk. `crs` None writes a file without CRS. The file appears under its name when it is whole, and not at
+    all where the context ends with an error.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        crs: str | None,
+        *,
+        scale: float = 0.01,
+        offset: Float64Array | None = None,
+        point_format: int = 6,
+        version: str = "1.4",
+    ) -> None:
+        self._path = path
+        self._partial = path.with_name(f".{os.getpid()}.{path.name}")
+        self._header = laspy.LasHeader(point_format=point_format, version=version)
+        self._header.generating_software = "crossloc3d_ros"
+        steps = np.full(3, scale)
+        if crs is not None:
+            parsed = parse_crs(crs)
+            self._header.add_crs(parsed, keep_compatibility=False)
+            if parsed.is_geographic:
+                steps[2] = max(scale, 0.001)
+        self._header.scales = steps
+        self._offset = offset
+        self._writer: laspy.LasWriter | None = None
+
+    def __enter__(self) -> LazWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if self._writer is None and kind is None:
+                self._open(np.zeros((1, 3)))
+            if self._writer is not None:
+                self._writer.close()
+            if kind is None:
+                self._partial.replace(self._path)
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def write(self, points: Float64Array, classification: UInt8Array) -> None:
+        """Append points (N, 3) and their classes (N,)."""
+        if len(points) == 0:
+            return
+        if self._writer is None:
+            self._open(points)
+        record = laspy.ScaleAwarePointRecord.zeros(len(points), header=self._header)
+        record.x, record.y, record.z = points[:, 0], points[:, 1], points[:, 2]
+        record.classification = classification
+        self._writer.write_points(record)  # type: ignore[union-attr]
+
+    def _open(self, points: Float64Array) -> None:
+        self._header.offsets = np.floor(points.min(axis=0)) if self._offset is None else self._offset
+        compress = self._path.suffix.lower() == ".laz"
+        self._writer = laspy.open(self._partial, mode="w", header=self._header, do_compress=compress)
+
+
 def write_laz(
     path: Path,
     points: Float64Array,
@@ -149,30 +213,9 @@ def write_laz(
     point_format: int = 6,
     version: str = "1.4",
 ) -> None:
-    """Write points (N, 3) and their classes (N,) as LAZ, or as LAS where the name says so.
-
-    `scale` is the step of the stored coordinates in the CRS's units: one number, or use 1e-7 for degrees. `crs` None
-    writes a file without CRS. The file appears under its name only when it is whole.
-    """
-    header = laspy.LasHeader(point_format=point_format, version=version)
-    steps = np.full(3, scale)
-    if crs is not None:
-        parsed = parse_crs(crs)
-        header.add_crs(parsed, keep_compatibility=False)
-        if parsed.is_geographic:
-            steps[2] = max(scale, 0.001)
-    header.scales = steps
-    if len(points):
-        header.offsets = np.floor(points.min(axis=0))
-    data = laspy.LasData(header)
-    data.x, data.y, data.z = points[:, 0], points[:, 1], points[:, 2]
-    data.classification = classification
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        data.write(partial, do_compress=path.suffix.lower() == ".laz")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write points (N, 3) and their classes (N,) as one file; see `LazWriter`."""
+    with LazWriter(path, crs, scale=scale, point_format=point_format, version=version) as writer:
+        writer.write(points, classification)
 
 
 def _chunk(record: Any) -> AerialChunk:
