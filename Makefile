@@ -1,0 +1,53 @@
+# Two commands do everything: `make demo` and `make test`. Each sets up what it needs and can be run again.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+TORCH ?= torch==2.13.0
+# The CPU build of torch; without this index pip takes several gigabytes of CUDA along.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: help setup demo test test-all lint bench colcon clean
+
+help:
+	@echo "make demo      build the Amsterdam map, drive a simulated robot through it, localize it, write out/demo/index.html"
+	@echo "make test      lint, types, import contracts and the quick tests"
+	@echo "make test-all  the slow tests too"
+	@echo "make bench     latencies and rates beside this machine's matrix-multiply peak, to out/bench/"
+	@echo "make colcon    build with colcon into install/, to check the ament packaging"
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: setup.py
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed, $(PYTHON) is older; try: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || { echo "Python's venv is missing; try: sudo apt-get install python3-venv"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -c 'import torch' 2>/dev/null || $(PIP) install --quiet --retries 1 --timeout 15 --extra-index-url $(TORCH_INDEX) '$(TORCH)'
+	$(PIP) install --quiet --editable '.[ros,cluster,test]'
+	touch $@
+
+demo: setup
+	$(BIN)/python -m crossloc3d_ros.cli.demo --output out/demo
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint
+	$(BIN)/python -m pytest
+
+test-all: lint
+	$(BIN)/python -m pytest -m 'slow or not slow'
+
+bench: setup
+	$(BIN)/python -m bench --output out/bench
+
+colcon: setup
+	$(PIP) install --quiet colcon-common-extensions
+	$(BIN)/colcon build --packages-select crossloc3d_ros --base-paths . --cmake-args
+
+clean:
+	rm -rf build install log out *.egg-info
