@@ -7,8 +7,12 @@ carries small launchers for `lib/crossloc3d_ros/` besides.
 
 from pathlib import Path
 
-from setuptools import find_packages, setup
-from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools import Command, find_packages, setup
+
+try:
+    from setuptools.command.bdist_wheel import bdist_wheel
+except ImportError:  # an older setuptools, as colcon finds it on Ubuntu 24.04: no wheel is built there
+    bdist_wheel = Command
 
 NAME = "crossloc3d_ros"
 COMMANDS = [
