@@ -19,7 +19,8 @@ from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 _CELL_M = 2.0
 _STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, never the road
 _STEP_M = 0.25  # and so is a step higher than this
-_CONE_M = 1.0  # what lies deeper than the steepest road would lead, and this much more, is a reflection
+_BENDING = 0.12  # the ground may fall away from the plane through it by this much a metre of distance
+_CONE_M = 0.4  # and by this much anywhere; what lies deeper is a reflection
 _FARTHEST_M = 150.0  # no sensor on a robot sees the ground beyond
 _LEVELS = 3  # the membrane is stretched over cells of 8, 4 and 2 m
 _SWEEPS = 12
@@ -51,9 +52,11 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
 def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int) -> Float32Array:
     """Run the steps: cells, bound, plane; once more along that plane; membrane; heights."""
     plane = np.zeros(3)
+    deepest = np.float32(_STEEPEST)  # before the slope is known
     for _ in range(2):
         # The second time "lowest" and "flat" are meant along the slope that the first time found.
-        lowest, where, share = _lowest_of_cells(points, cells, plane)
+        lowest, where, share = _lowest_of_cells(points, cells, plane, deepest)
+        deepest = np.float32(_BENDING)
         bound = _steepest_bound(lowest)
         _bound_by_rays(bound, lowest, where, sensor_height)
         weight = np.zeros((cells, cells), np.float32)
@@ -89,7 +92,7 @@ def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int
 
 
 @njit(cache=True, nogil=True)
-def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array):  # type: ignore[no-untyped-def]
+def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array, deepest: float):  # type: ignore[no-untyped-def]
     """Return each cell's lowest z (infinite where there is none to trust), its x and y, and how flat the cell is.
 
     Lowest is the point that lies lowest over the plane. Flat is the share of the points up to 2 m above it that lie
@@ -110,12 +113,14 @@ def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array):  # 
         cell_of[i] = -1
         if not (abs(x) < half and abs(y) < half):
             continue
-        allowed = np.sqrt(x * x + y * y) * np.float32(_STEEPEST) + np.float32(_CONE_M)
-        if not (abs(z) <= allowed):
-            continue
+        distance = np.sqrt(x * x + y * y)
+        if not (z <= distance * np.float32(_STEEPEST) + np.float32(_CONE_M)):
+            continue  # no ground; and infinity stays out of the sums
         row, column = min(int((y + half) * inverse), cells - 1), min(int((x + half) * inverse), cells - 1)
-        cell_of[i] = row * cells + column
         over[i] = z - (a * x + b * y + c)
+        if not (over[i] >= -(distance * deepest + np.float32(_CONE_M))):
+            continue
+        cell_of[i] = row * cells + column
         held = lowest[row, column]
         first = x < where[row, column, 0] or (x == where[row, column, 0] and y < where[row, column, 1])
         if over[i] < held or (over[i] == held and first):  # whatever the order of the points

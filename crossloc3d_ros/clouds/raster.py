@@ -14,7 +14,7 @@ from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 
 Bounds = tuple[float, float, float, float]
-"""min easting, min northing, max easting, max northing; metres."""
+"""min easting, min northing, max easting, max northing; metres; the maxima are exclusive."""
 
 _RELAXATIONS = 24
 _MOST_CELLS = 200_000_000
@@ -109,7 +109,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
     for i in range(points.shape[0]):
         if mask[i]:
             column = np.floor((points[i, 0] - west) / cell)
-            row = np.floor((north - points[i, 1]) / cell)
+            row = np.ceil((north - points[i, 1]) / cell) - 1  # western and southern edges belong to a cell
             z = points[i, 2]
             if 0 <= row < height and 0 <= column < width and np.isfinite(z):
                 sums[int(row), int(column)] += z
@@ -122,7 +122,7 @@ def _highest(points: Float64Array, west: float, north: float, cell: float, heigh
     values = np.full((height, width), np.nan, np.float32)
     for i in range(points.shape[0]):
         column = np.floor((points[i, 0] - west) / cell)
-        row = np.floor((north - points[i, 1]) / cell)
+        row = np.ceil((north - points[i, 1]) / cell) - 1  # western and southern edges belong to a cell
         z = points[i, 2]
         if 0 <= row < height and 0 <= column < width and np.isfinite(z):
             held = values[int(row), int(column)]

@@ -16,6 +16,7 @@ from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array, Patch
 
 _BIN_M = 5.0
 _MOST_BINS = 4_000_000
+_FARTHEST_M = 4e7
 
 
 def submap_centres(bounds: tuple[float, float, float, float], spacing_m: float) -> Float64Array:
@@ -60,16 +61,16 @@ class SubmapCutter:
     def __init__(self, points: Float64Array, preprocessing: PreprocessingConfig) -> None:
         check_points(points)
         self._preprocessing = preprocessing
-        if preprocessing.ground_clearance_m > 0:
-            # Compared in float32, as the crop will do, or a point on the edge would be kept there and lost here.
-            points = points[points[:, 2].astype(np.float32) >= np.float32(preprocessing.ground_clearance_m)]
-        points = points[np.isfinite(points).all(axis=1)]
-        self._origin = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
-        span = points[:, :2].max(axis=0) - self._origin if len(points) else np.zeros(2)
+        clearance = preprocessing.ground_clearance_m
+        # Compared in float32, as the crop will do, or a point on the edge would be kept there and lost here.
+        lowest = np.float32(clearance if clearance > 0 else -np.inf)
+        bounds = _bounds(points, lowest)
+        self._origin = np.array(bounds[:2])
+        span = np.array(bounds[2:]) - bounds[:2]
         self._bin_m = max(_BIN_M, float(np.sqrt(span[0] * span[1] / _MOST_BINS)), float(span.max()) / _MOST_BINS)
         self._columns, self._rows = (int(v) + 1 for v in span // self._bin_m)
         self._points, self._starts = _sort_into_bins(
-            np.ascontiguousarray(points, np.float64), self._origin, self._bin_m, self._columns, self._rows
+            points, lowest, self._origin, self._bin_m, self._columns, self._rows
         )
 
     def cut(self, centre: npt.ArrayLike) -> Patch | None:
@@ -96,27 +97,49 @@ def _patch_around(around: Float32Array, preprocessing: PreprocessingConfig) -> P
 
 
 @njit(cache=True, nogil=True)
+def _may_stand(points: Float64Array, i: int, lowest: float) -> bool:
+    """Return whether a point can be in any submap; no map grid reaches farther than the earth's girth."""
+    inside = abs(points[i, 0]) < _FARTHEST_M and abs(points[i, 1]) < _FARTHEST_M
+    return bool(inside and np.isfinite(points[i, 2]) and np.float32(points[i, 2]) >= lowest)
+
+
+@njit(cache=True, nogil=True)
+def _bounds(points: Float64Array, lowest: float):  # type: ignore[no-untyped-def]
+    """Return min easting, min northing, max easting, max northing of the points that count; zeros without any."""
+    west, south, east, north = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(points.shape[0]):
+        if _may_stand(points, i, lowest):
+            west, east = min(west, points[i, 0]), max(east, points[i, 0])
+            south, north = min(south, points[i, 1]), max(north, points[i, 1])
+    if west > east:
+        return 0.0, 0.0, 0.0, 0.0
+    return west, south, east, north
+
+
+@njit(cache=True, nogil=True)
 def _sort_into_bins(  # type: ignore[no-untyped-def]
-    points: Float64Array, origin: Float64Array, bin_m: float, columns: int, rows: int
+    points: Float64Array, lowest: float, origin: Float64Array, bin_m: float, columns: int, rows: int
 ):
-    """Return the points in the order of their bins (row by row) and where each bin starts (counting sort)."""
+    """Return the points that count in the order of their bins (row by row) and where each bin starts."""
     n = points.shape[0]
-    bins = np.empty(n, np.int64)
+    bins = np.full(n, -1, np.int64)
     starts = np.zeros(columns * rows + 1, np.int64)
     for i in range(n):
-        column = min(columns - 1, int((points[i, 0] - origin[0]) / bin_m))
-        row = min(rows - 1, int((points[i, 1] - origin[1]) / bin_m))
-        bins[i] = row * columns + column
-        starts[bins[i] + 1] += 1
+        if _may_stand(points, i, lowest):
+            column = min(columns - 1, int((points[i, 0] - origin[0]) / bin_m))
+            row = min(rows - 1, int((points[i, 1] - origin[1]) / bin_m))
+            bins[i] = row * columns + column
+            starts[bins[i] + 1] += 1
     for b in range(columns * rows):
         starts[b + 1] += starts[b]
-    ordered = np.empty_like(points)
+    ordered = np.empty((starts[-1], 3))
     cursor = starts[:-1].copy()
     for i in range(n):
-        place = cursor[bins[i]]
-        cursor[bins[i]] += 1
-        for axis in range(3):
-            ordered[place, axis] = points[i, axis]
+        if bins[i] >= 0:
+            place = cursor[bins[i]]
+            cursor[bins[i]] += 1
+            for axis in range(3):
+                ordered[place, axis] = points[i, axis]
     return ordered, starts
 
 

@@ -90,7 +90,7 @@ def test_where_on_earth_the_tile_lies_changes_nothing(offset: tuple[float, float
     points = a_tile(150.0)
     centre = np.array([WEST + 75.0, SOUTH + 75.0])
     here = SubmapCutter(points, CONFIG).cut(centre)
-    there = SubmapCutter(points + [*offset, 0.0], CONFIG).cut(centre + offset)
+    there = SubmapCutter(points + np.array([*offset, 0.0]), CONFIG).cut(centre + offset)
     assert here is not None and there is not None
     np.testing.assert_array_equal(here.points, there.points)
 

@@ -1,0 +1,292 @@
+"""The ground: found under a robot in every street and slope it may stand on, and in surveys without classes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from crossloc3d_ros.clouds.ground import classify_ground, scan_heights
+from crossloc3d_ros.clouds.raster import surface_raster, terrain_raster
+from crossloc3d_ros.errors import CloudError
+
+Array = npt.NDArray[np.float64]
+Cast = Callable[..., Any]
+Box = tuple[float, float, float, float, float]
+HEIGHT_M = 1.2
+
+
+def plane(a: float, b: float) -> Callable[[Array, Array], Array]:
+    return lambda x, y: a * x + b * y
+
+
+def arc(radius_m: float) -> Callable[[Array, Array], Array]:
+    """A valley along y; a crest where the radius is negative."""
+    return lambda x, y: radius_m * (np.sqrt(1 + (x / radius_m) ** 2) - 1)
+
+
+def street(seed: int, *, half_width: float = 6.0) -> list[Box]:
+    """Houses and parked cars on both sides, a car ahead and a van behind."""
+    rng = np.random.default_rng(seed)
+    boxes: list[Box] = [(9, 0.5, 4.3, 1.8, 1.5), (-14, -0.5, 6, 2.2, 2.6)]
+    for side in (-1, 1):
+        x = -100.0
+        while x < 100:
+            front = rng.uniform(8, 25)
+            if rng.random() < 0.85:
+                boxes.append((x + front / 2, side * (half_width + 6), front - 0.2, 12, rng.uniform(6, 15)))
+            x += front
+        boxes += [
+            (x, side * (half_width - 2), 4.3, 1.8, 1.5)
+            for x in np.arange(-60, 60, 5.5)
+            if abs(x) > 3.5 and rng.random() < 0.75
+        ]
+    return boxes
+
+
+def park(seed: int) -> list[Box]:
+    """Trunks, and three houses far off."""
+    rng = np.random.default_rng(seed)
+    trunks = [(x, y, 0.6, 0.6, 8.0) for x, y in rng.uniform(-60, 60, (40, 2)) if np.hypot(x, y) > 4]
+    return [*trunks, (35, 10, 12, 30, 6), (-20, -30, 20, 8, 5), (-40, 30, 10, 10, 9)]
+
+
+def closed_in() -> list[Box]:
+    """Walls around a courtyard: hardly any ground to be seen, none beyond."""
+    return [(0, 8, 20, 2, 10), (0, -8, 20, 2, 10), (10, 0, 2, 18, 10), (-10, 0, 2, 18, 10)]
+
+
+def among_cars() -> list[Box]:
+    return [(6 * np.cos(a), 6 * np.sin(a), 3.0, 3.0, 1.5) for a in np.arange(8) * np.pi / 4] + park(5)
+
+
+WORLDS = {
+    "nothing": (plane(0, 0), []),
+    "a flat park": (plane(0, 0), park(0)),
+    "a flat street": (plane(0, 0), street(1)),
+    "a lane": (plane(0, 0), street(2, half_width=4.5)),
+    "a courtyard": (plane(0, 0.05), closed_in()),
+    "cars all around": (plane(0.03, 0.02), among_cars()),
+    "10 % up the park": (plane(0.07, 0.07), park(1)),
+    "20 % up the park": (plane(0.14, 0.14), park(1)),
+    "20 % and nothing": (plane(0.2, 0.0), []),
+    "10 % along the street": (plane(0.1, 0), street(3)),
+    "20 % along the street": (plane(0.2, 0), street(3)),
+    "20 % across the street": (plane(0, 0.2), street(4)),
+    "hills": (lambda x, y: 3 * np.sin(x / 25 + 0.3) + 2 * np.cos(y / 18 + 1), street(9)),
+    "a crest": (arc(-250.0), street(5)),
+    "a valley": (arc(250.0), park(2)),
+    "a ramp begins": (lambda x, y: np.where(x > 8, 0.15 * (x - 8), 0.0), park(4)),
+}
+
+
+@pytest.fixture(scope="module")
+def scans(cast: Cast) -> dict[str, Any]:
+    return {name: cast(*world) for name, world in WORLDS.items()}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_ground_goes_and_structure_stays(scans: dict[str, Any], name: str) -> None:
+    scan = scans[name]
+    heights = scan_heights(scan.points, HEIGHT_M)
+    near = (np.abs(scan.points[:, :2]) < 50).all(axis=1)
+    ground = near & scan.on_ground
+    structure = near & ~scan.on_ground & (scan.height_m > 1.0)
+    assert np.mean(heights[ground] >= 0.5) < 0.015
+    if structure.any():
+        assert np.mean(heights[structure] < 0.5) < 0.01
+        assert np.median(np.abs(heights - scan.height_m)[structure]) < 0.3
+
+
+def test_the_slopes_are_out_of_a_flat_filters_reach(scans: dict[str, Any]) -> None:
+    """The worlds above mean something: cutting at a height in the base frame fails in them."""
+    scan = scans["20 % along the street"]
+    near = (np.abs(scan.points[:, :2]) < 50).all(axis=1)
+    assert np.mean(scan.points[near & scan.on_ground, 2] >= 0.5) > 0.2
+    assert np.mean(scan.points[near & ~scan.on_ground & (scan.height_m > 1), 2] < 0.5) > 0.1
+
+
+def test_car_roofs_and_walls_are_not_ground(scans: dict[str, Any]) -> None:
+    scan = scans["cars all around"]
+    heights = scan_heights(scan.points, HEIGHT_M)
+    cars = ~scan.on_ground & (np.hypot(scan.points[:, 0], scan.points[:, 1]) < 9) & (scan.height_m > 0.6)
+    assert cars.sum() > 2000
+    assert np.abs(heights - scan.height_m)[cars].max() < 0.2
+
+
+def test_a_roof_beside_a_high_sensor_is_not_ground() -> None:
+    """A sensor at 2.4 m looks down on the roofs of the cars around it: flat, dense and 1.5 m up."""
+    rng = np.random.default_rng(0)
+    road = np.column_stack([rng.uniform(-40, 40, 4000), rng.uniform(-2, 2, 4000), rng.normal(0, 0.02, 4000)])
+    roofs = np.vstack(
+        [np.column_stack([rng.uniform(x, x + 4, 300), side * rng.uniform(3, 5, 300), rng.normal(1.5, 0.02, 300)])
+         for x in range(-30, 30, 6) for side in (-1, 1)]
+    )  # fmt: skip
+    heights = scan_heights(np.vstack([road, roofs]).astype(np.float32), 2.4)
+    assert np.abs(heights[:4000]).max() < 0.3
+    assert heights[4000:].min() > 1.0
+
+
+@pytest.mark.parametrize("turn_deg", [31.0, 90.0, 200.0])
+def test_turning_on_the_spot_changes_the_heights_little(scans: dict[str, Any], turn_deg: float) -> None:
+    scan = scans["20 % along the street"]
+    turned = Rotation.from_euler("z", turn_deg, degrees=True).apply(scan.points).astype(np.float32)
+    difference = scan_heights(turned, HEIGHT_M) - scan_heights(scan.points, HEIGHT_M)
+    near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < 40
+    assert np.percentile(np.abs(difference[near]), 95) < 0.25
+
+
+def test_the_order_of_the_points_changes_nothing(scans: dict[str, Any]) -> None:
+    points = scans["hills"].points
+    order = np.random.default_rng(0).permutation(len(points))
+    np.testing.assert_array_equal(scan_heights(points, HEIGHT_M)[order], scan_heights(points[order], HEIGHT_M))
+
+
+def test_reflections_below_the_ground_do_not_pull_it_down(scans: dict[str, Any]) -> None:
+    scan = scans["a flat street"]
+    rng = np.random.default_rng(0)
+    below = np.column_stack([rng.uniform(-40, 40, (60, 2)), rng.uniform(-8, -1, 60)])
+    cluster = rng.normal((6.0, 1.0, -1.5), 0.2, (40, 3))
+    heights = scan_heights(np.vstack([scan.points, below, cluster]).astype(np.float32), HEIGHT_M)[: len(scan.points)]
+    near = (np.abs(scan.points[:, :2]) < 50).all(axis=1)
+    assert np.mean(heights[near & scan.on_ground] >= 0.5) < 0.03
+
+
+@pytest.mark.parametrize("error_m", [-0.4, 0.4])
+def test_a_mounting_measured_badly_is_forgiven(scans: dict[str, Any], error_m: float) -> None:
+    scan = scans["a flat park"]
+    heights = scan_heights(scan.points + np.float32([0, 0, error_m]), HEIGHT_M + error_m)
+    near = (np.abs(scan.points[:, :2]) < 50).all(axis=1)
+    assert np.mean(heights[near & scan.on_ground] >= 0.5) < 0.03
+
+
+def test_without_ground_in_sight_the_base_stands_on_it() -> None:
+    """Only a wall from 1 m up: its height is counted from where the robot stands."""
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([np.full(2000, 20.0), rng.uniform(-15, 15, 2000), rng.uniform(1, 6, 2000)])
+    heights = scan_heights(wall.astype(np.float32), HEIGHT_M)
+    assert np.abs(heights - wall[:, 2]).max() < 0.8
+
+
+@pytest.mark.parametrize("count", [0, 1, 12])
+def test_a_handful_of_points_has_heights(count: int) -> None:
+    points = np.random.default_rng(0).uniform(-5, 5, (count, 3)).astype(np.float32)
+    heights = scan_heights(points, HEIGHT_M)
+    assert heights.shape == (count,) and heights.dtype == np.float32
+    assert np.isfinite(heights).all()
+
+
+def test_hopeless_points_spoil_nothing(scans: dict[str, Any]) -> None:
+    points = scans["a lane"].points
+    bad = np.array([[np.nan] * 3, [np.inf] * 3, [1e30] * 3, [-1e30] * 3, [0, 0, np.nan], [0, 0, -1e30], [1e30, 0, 0]])
+    heights = scan_heights(np.vstack([points, bad]).astype(np.float32), HEIGHT_M)
+    np.testing.assert_array_equal(heights[: len(points)], scan_heights(points, HEIGHT_M))
+    assert np.isnan(heights[len(points)]) and np.isnan(heights[len(points) + 4])
+    assert scan_heights(np.full((100, 3), np.nan, np.float32), HEIGHT_M).shape == (100,)
+
+
+def test_wrong_arguments_are_refused() -> None:
+    with pytest.raises(CloudError, match="points_base"):
+        scan_heights(np.zeros((4, 2), np.float32), HEIGHT_M)
+    with pytest.raises(CloudError, match="sensor_height_m"):
+        scan_heights(np.zeros((4, 3), np.float32), float("nan"))
+
+
+def test_a_scan_takes_a_few_milliseconds(scans: dict[str, Any]) -> None:
+    points = scans["a courtyard"].points
+    assert len(points) == 28_800
+    seconds = []
+    for _ in range(10):
+        start = time.perf_counter()
+        scan_heights(points, HEIGHT_M)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.005
+
+
+# --- aerial -----------------------------------------------------------------------------------------------------
+
+
+def a_survey(terrain: Callable[[Array, Array], Array], seed: int = 0) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """150 x 150 m at 4 points/m2: houses up to 40 m wide, sheds, cars and trees on the terrain; mask of its ground."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 150, (2, 90_000))
+    above = np.zeros(len(x))
+    for cx, cy, w, d, h in [(40, 40, 40, 30, 9), (100, 45, 14, 50, 6), (60, 110, 60, 12, 12), (120, 115, 5, 4, 2.6)]:
+        above[(abs(x - cx) < w / 2) & (abs(y - cy) < d / 2)] = h
+    for cx, cy in rng.uniform(5, 145, (25, 2)):
+        above[(abs(x - cx) < 2.1) & (abs(y - cy) < 0.9)] = 1.5
+    crowns = rng.uniform(5, 145, (15, 2))
+    for cx, cy in crowns:
+        canopy = (np.hypot(x - cx, y - cy) < 4) & (rng.uniform(size=len(x)) < 0.8)
+        above[canopy] = np.maximum(above[canopy], rng.uniform(3, 9, int(canopy.sum())))
+    z = terrain(x, y) + above + rng.normal(0, 0.04, len(x))
+    return np.column_stack([x + 628_000, y + 5_803_000, z]), above == 0
+
+
+@pytest.mark.parametrize(
+    "terrain",
+    [plane(0, 0), plane(0.2, 0), plane(0.1, -0.1), lambda x, y: 6 * np.sin(x / 40) + 5 * np.cos(y / 35)],
+    ids=["flat", "20 % slope", "diagonal slope", "hills"],
+)
+def test_aerial_ground_is_told_from_houses_cars_and_trees(terrain: Callable[[Array, Array], Array]) -> None:
+    points, ground = a_survey(terrain)
+    found = classify_ground(points)
+    assert np.mean(ground[found]) > 0.985  # precision
+    assert np.mean(found[ground]) > 0.95  # recall
+
+
+def test_stray_aerial_points_are_not_ground_and_spoil_nothing() -> None:
+    points, _ = a_survey(plane(0.05, 0))
+    clean = classify_ground(points)
+    stray = np.array([[628_050.0, 5_803_050.0, -40.0], [628_070.0, 5_803_020.0, 300.0], [np.nan, 5_803_020.0, 1.0]])
+    found = classify_ground(np.vstack([points, stray]))
+    assert not found[-3:].any()
+    assert np.mean(found[:-3] == clean) > 0.999
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_almost_no_aerial_points_are_classified_too(count: int) -> None:
+    points = np.array([[10.0, 20.0, 3.0], [11.5, 20.0, 3.1]])[:count]
+    assert classify_ground(points).tolist() == [True] * count
+
+
+def test_an_aerial_point_in_another_world_is_named() -> None:
+    with pytest.raises(CloudError, match="stray points"):
+        classify_ground(np.array([[0.0, 0.0, 0.0], [1e9, 1e9, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("tile", "precision", "recall", "terrain_rmse_m"),
+    [
+        ("delft_AHN3_2014_EPSG28992.laz", 0.945, 0.995, 0.10),
+        pytest.param("amsterdam_centre_AHN3_2014_EPSG28992.laz", 0.895, 0.99, 0.25, marks=pytest.mark.slow),
+        pytest.param("amsterdam_centre_AHN2_2010_EPSG28992.laz", 0.885, 0.98, 0.32, marks=pytest.mark.slow),
+    ],
+)
+def test_real_tiles_against_their_class_2(
+    shared: Callable[[str], Any], tile: str, precision: float, recall: float, terrain_rmse_m: float
+) -> None:
+    """Measured: Delft 0.952 / 0.998, Amsterdam AHN3 0.905 / 0.994, AHN2 0.894 / 0.985.
+
+    Half of what the survey does not call ground lies within 0.15 m of it: canals, decks, kerbs, low plants. So
+    the third claim matters more: objects above 1.5 m are not taken, and the terrain differs by decimetres.
+    """
+    laspy = pytest.importorskip("laspy")
+    las = laspy.read(shared(f"data/aerial/{tile}"))
+    points = np.column_stack([las.x, las.y, las.z])
+    truth = np.asarray(las.classification) == 2
+    found = classify_ground(points)
+    assert np.mean(truth[found]) > precision
+    assert np.mean(found[truth]) > recall
+
+    bounds = (*points[:, :2].min(axis=0), *(points[:, :2].max(axis=0) + 0.01))
+    own, theirs = terrain_raster(points, found, bounds, 1.0), terrain_raster(points, truth, bounds, 1.0)
+    assert np.sqrt(np.mean((own.values - theirs.values) ** 2)) < terrain_rmse_m
+    high = points[:, 2] - theirs.sample(points[:, 0], points[:, 1]) > 1.5
+    assert np.mean(found[high]) < 0.001
+    assert np.nanmax(surface_raster(points, bounds, 1.0).values) == pytest.approx(points[:, 2].max(), abs=1e-4)
