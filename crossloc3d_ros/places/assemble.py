@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -37,10 +37,11 @@ def write_map(
     config: BuildConfig,
     counts: BuildCounts,
     sources: Sequence[SourceRecord],
+    advance: Callable[[int], None],
 ) -> Manifest:
     """Write all files of the map into `folder`, which must not be in use, and return its manifest.
 
-    Raises AerialDataError where no tile has a submap.
+    `advance` is told of each file. Raises AerialDataError where no tile has a submap.
     """
     ordered = sorted(tiles, key=lambda item: (item[0].key[1], item[0].key[0]))
     count = sum(report.submaps for report, _ in ordered)
@@ -60,11 +61,15 @@ def write_map(
     write_descriptors(
         folder / store.DESCRIPTORS, (result.descriptors for result in results()), count, encoder.descriptor_size
     )
+    advance(1)
     ground_heights = _write_submaps(folder / store.SUBMAPS, results(), count)
+    advance(1)
     bounds = _union([report.data_bounds for report, _ in ordered if report.data_bounds is not None])
     rasters = _TileRasters({report.key: path for report, path in ordered}, config)
     write_geotiff(folder / store.TERRAIN, bounds, config.cell_m, crs, rasters.terrain, "terrain height")
+    advance(1)
     write_geotiff(folder / store.SURFACE, bounds, config.cell_m, crs, rasters.surface, "surface height")
+    advance(1)
     methods = {source.ground for source in sources}
     manifest = Manifest(
         crs=crs,

@@ -52,7 +52,7 @@ class BuildProgress:
     done: int
     total: int
     unit: str
-    """`points`, `submaps` or `files`."""
+    """`points`, `places` or `files`."""
 
 
 @dataclass(frozen=True)
@@ -126,25 +126,24 @@ def build_map(
             started = time.perf_counter()
             spooled, points_read = _read_survey(work, headers, target_crs, config, workers, report)
             read_at = time.perf_counter()
-            tasks, stray = _plan_tiles(work, headers, spooled, config, encoder)
-            tiles, fresh = _build_tiles(tasks, workers, report)
+            plan = _plan_tiles(work, spooled, config, encoder)
+            tiles, fresh = _build_tiles(plan, workers, report)
             built_at = time.perf_counter()
-        report(BuildProgress("writing", 0, len(store.DATA_FILES), "files"))
         manifest = write_map(
             work / "map",
-            [(tile_report, task.result) for task, tile_report in tiles],
+            [(tile_report, plan.result(tile_report.key)) for tile_report in tiles],
             crs=target_crs,
             vertical_reference=vertical.name,
             geoid_separation_m=0.0 if vertical.ellipsoidal else geoid_separation_m,
             encoder=encoder,
             config=config,
-            counts=_counts(spooled, [r for _, r in tiles], stray),
-            sources=_sources(headers, spooled, config, tiles),
+            counts=_counts(spooled, tiles, plan.stray_points),
+            sources=_sources(headers, spooled, tiles),
+            advance=_Counter("writing", 0, len(store.DATA_FILES), "files", report),
         )
         _publish(work / "map", output)
-        report(BuildProgress("writing", len(store.DATA_FILES), len(store.DATA_FILES), "files"))
         written_at = time.perf_counter()
-        _remove_work(work)
+        shutil.rmtree(work, ignore_errors=True)
     return BuildReport(
         output=output,
         manifest=manifest,
@@ -219,8 +218,8 @@ def _check_config(config: BuildConfig) -> None:
 def _encoder_and_loader(encoder: DescriptorEncoder | EncoderLoader) -> tuple[EncoderLoader, DescriptorEncoder]:
     if callable(encoder):
         return encoder, encoder()
-    loaded = encoder
-    return (lambda: loaded), loaded
+    given = encoder
+    return (lambda: given), given
 
 
 def _utm_crs(headers: Sequence[AerialHeader]) -> str:
@@ -293,11 +292,15 @@ def _read_survey(
 ) -> tuple[list[SpoolReport], int]:
     """Sort the points of every file into tiles; return the reports and how many points were read in this run."""
     total = sum(header.point_count for header in headers)
-    folders = [_spool_of(work, index) for index in range(len(headers))]
-    tasks = [
+    missing = {
+        index: header for index, header in enumerate(headers) if spool.read_report(_spool_of(work, index)) is None
+    }
+    to_read = sum(header.point_count for header in missing.values())
+    advance = _Counter("reading", total - to_read, total, "points", progress)
+    tasks = (
         SpoolTask(
             source=header.path,
-            folder=folder,
+            folder=_spool_of(work, index),
             point_count=header.point_count,
             source_crs=header.crs,
             vertical_metres_per_unit=header.vertical_metres_per_unit,
@@ -306,33 +309,59 @@ def _read_survey(
             chunk_points=config.chunk_points,
             threads=workers.shared_threads,
         )
-        for header, folder in zip(headers, folders, strict=True)
-    ]
-    missing = [task for task in tasks if spool.read_report(task.folder) is None]
-    advance = _Counter("reading", total - sum(task.point_count for task in missing), total, "points", progress)
-    for _ in workers.run(spool_file, [(task, task.point_count) for task in missing], advance):
+        # The largest first, so that no worker is left alone with it at the end.
+        for index, header in sorted(missing.items(), key=lambda item: -item[1].point_count)
+    )
+    for _ in workers.run(spool_file, ((task, task.point_count) for task in tasks), advance):
         pass
-    reports = [spool.read_report(folder) for folder in folders]
+    reports = [spool.read_report(_spool_of(work, index)) for index in range(len(headers))]
     if not all(reports):
         raise MapError(f"the work folder {work} was changed by somebody else; delete it and build again")
-    return [report for report in reports if report is not None], sum(task.point_count for task in missing)
+    return [report for report in reports if report is not None], to_read
 
 
 def _spool_of(work: Path, index: int) -> Path:
     return work / "spool" / f"{index:06d}"
 
 
-def _plan_tiles(
-    work: Path,
-    headers: Sequence[AerialHeader],
-    spooled: Sequence[SpoolReport],
-    config: BuildConfig,
-    encoder: DescriptorEncoder,
-) -> tuple[list[TileTask], int]:
-    """Return the tiles to be built, south to north, and the number of stray points that are left aside.
+@dataclass(frozen=True, eq=False)
+class _TilePlan:
+    """Which tiles there are and what each is made from."""
 
-    Stray points lie in tiles with less than a submap's worth of points and none but such tiles around: an outlier
-    a thousand kilometres away must not span the rasters.
+    work: Path
+    config: BuildConfig
+    reach: int
+    """Rings of tiles around a tile that it looks into."""
+    files: dict[TileKey, list[int]]
+    """The spooled files that have points in a tile."""
+    classified: list[bool]
+    """Whether each spooled file has ground classes."""
+    keys: list[TileKey]
+    """The tiles to be built, those with the most points first, so that no worker is left alone with one at the end."""
+    stray_points: int
+
+    def result(self, key: TileKey) -> Path:
+        return self.work / "tiles" / f"{key[0]}_{key[1]}.npz"
+
+    def centres(self, key: TileKey) -> int:
+        return len(submap_centres(spool.tile_bounds(key, self.config.tile_m), self.config.spacing_m))
+
+    def task(self, key: TileKey) -> TileTask:
+        sources = tuple(
+            (_spool_of(self.work, index), near, self.classified[index])
+            for near in _around(key, self.reach)
+            for index in self.files.get(near, ())
+        )
+        return TileTask(key, sources, self.result(key), self.config)
+
+
+def _plan_tiles(
+    work: Path, spooled: Sequence[SpoolReport], config: BuildConfig, encoder: DescriptorEncoder
+) -> _TilePlan:
+    """Find the tiles to be built.
+
+    Stray points are left aside: those in tiles with less than a submap's worth of points and none but such tiles
+    around. An outlier a thousand kilometres away must not span the rasters.
     """
     files: dict[TileKey, list[int]] = defaultdict(list)
     counts: dict[TileKey, int] = defaultdict(int)
@@ -342,29 +371,21 @@ def _plan_tiles(
             counts[column, row] += count
     enough = {key for key, count in counts.items() if count >= encoder.preprocessing.min_points}
     kept = [key for key in counts if any(near in enough for near in _around(key, 1))]
-    stray = sum(counts.values()) - sum(counts[key] for key in kept)
+    points = sum(counts.values())
     if not kept:
         raise AerialDataError(
-            f"the area is empty: {sum(counts.values()):,} of {sum(h.point_count for h in headers):,} points are left "
-            "without noise and withheld points, and nowhere do enough of them lie together for a submap"
+            f"the area is empty: {points:,} of {sum(r.points_in_file for r in spooled):,} points are left without "
+            "noise and withheld points, and nowhere do enough of them lie together for a submap"
         )
-    margin = tile.margin_m(encoder.preprocessing.half_extent_m, config.cell_m)
-    reach = math.ceil(margin / config.tile_m)
-    tasks = [
-        TileTask(
-            key=key,
-            sources=tuple(
-                (_spool_of(work, index), near, spooled[index].classified)
-                for near in _around(key, reach)
-                for index in files.get(near, ())
-            ),
-            result=work / "tiles" / f"{key[0]}_{key[1]}.npz",
-            config=config,
-            centres=len(submap_centres(spool.tile_bounds(key, config.tile_m), config.spacing_m)),
-        )
-        for key in sorted(kept, key=lambda k: (k[1], k[0]))
-    ]
-    return tasks, stray
+    return _TilePlan(
+        work=work,
+        config=config,
+        reach=math.ceil(tile.margin_m(encoder.preprocessing.half_extent_m, config.cell_m) / config.tile_m),
+        files=files,
+        classified=[report.classified for report in spooled],
+        keys=sorted(kept, key=lambda key: (-counts[key], key)),
+        stray_points=points - sum(counts[key] for key in kept),
+    )
 
 
 def _around(key: TileKey, reach: int) -> list[TileKey]:
@@ -373,18 +394,17 @@ def _around(key: TileKey, reach: int) -> list[TileKey]:
 
 
 def _build_tiles(
-    tasks: Sequence[TileTask], workers: Workers, progress: ProgressCallback
-) -> tuple[list[tuple[TileTask, TileReport]], list[TileReport]]:
-    """Build the tiles that are not built yet; return all of them, and the reports of those built in this run."""
-    if tasks:
-        tasks[0].result.parent.mkdir(parents=True, exist_ok=True)
-    done = {task.key: report for task in tasks if (report := tile.read_report(task.result)) is not None}
-    missing = [task for task in tasks if task.key not in done]
-    total = sum(task.centres for task in tasks)
-    advance = _Counter("encoding", total - sum(task.centres for task in missing), total, "submaps", progress)
-    fresh = list(workers.run_encoding(build_tile, [(task, task.centres) for task in missing], advance))
-    done.update({report.key: report for report in fresh})
-    return [(task, done[task.key]) for task in tasks], fresh
+    plan: _TilePlan, workers: Workers, progress: ProgressCallback
+) -> tuple[list[TileReport], list[TileReport]]:
+    """Build the tiles that are not built yet; return the reports of all, and of those built in this run."""
+    (plan.work / "tiles").mkdir(exist_ok=True)
+    done = [report for key in plan.keys if (report := tile.read_report(plan.result(key))) is not None]
+    done_keys = {report.key for report in done}
+    missing = [key for key in plan.keys if key not in done_keys]
+    total = sum(plan.centres(key) for key in plan.keys)
+    advance = _Counter("encoding", sum(plan.centres(r.key) for r in done), total, "places", progress)
+    fresh = list(workers.run_encoding(build_tile, ((plan.task(key), plan.centres(key)) for key in missing), advance))
+    return done + fresh, fresh
 
 
 def _counts(spooled: Sequence[SpoolReport], tiles: Sequence[TileReport], stray: int) -> BuildCounts:
@@ -405,10 +425,9 @@ def _counts(spooled: Sequence[SpoolReport], tiles: Sequence[TileReport], stray: 
 def _sources(
     headers: Sequence[AerialHeader],
     spooled: Sequence[SpoolReport],
-    config: BuildConfig,
-    tiles: Sequence[tuple[TileTask, TileReport]],
+    tiles: Sequence[TileReport],
 ) -> list[SourceRecord]:
-    methods = {report.key: report.ground for _, report in tiles}
+    methods = {report.key: report.ground for report in tiles}
     records = []
     for header, report in zip(headers, spooled, strict=True):
         ground: GroundMethod = "filter"
@@ -421,18 +440,12 @@ def _sources(
 
 def _publish(finished: Path, output: Path) -> None:
     """Put the finished map in its place; at no moment is there half a map under its name."""
+    replaced = output.with_name(f".{output.name}.replaced")
+    shutil.rmtree(replaced, ignore_errors=True)
     if output.exists():
-        replaced = output.with_name(f".{output.name}.replaced")
-        shutil.rmtree(replaced, ignore_errors=True)
         output.rename(replaced)
-        finished.rename(output)
-        shutil.rmtree(replaced, ignore_errors=True)
-    else:
-        finished.rename(output)
-
-
-def _remove_work(work: Path) -> None:
-    shutil.rmtree(work, ignore_errors=True)
+    finished.rename(output)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 class _Counter:

@@ -44,8 +44,6 @@ class TileTask:
     """Folder in the spool, tile, and whether that file is classified: of the tile and of those around it."""
     result: Path
     config: BuildConfig
-    centres: int
-    """How many submaps may come out of it: the measure of progress."""
 
 
 @dataclass(frozen=True)

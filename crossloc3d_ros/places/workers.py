@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
@@ -37,14 +38,17 @@ class Workers(Protocol):
     """Whether a task may use every core of its machine."""
 
     def run(
-        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+        self, function: Callable[[Task, Advance | None], Result], tasks: Iterable[tuple[Task, int]], advance: Advance
     ) -> Iterator[Result]:
-        """Yield the results as they come; tasks come with their sizes, of which `advance` is told."""
+        """Yield the results as they come; tasks come with their sizes, of which `advance` is told.
+
+        The tasks are taken from the iterable as they are needed: a state has a million tiles.
+        """
 
     def run_encoding(
         self,
         function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
-        tasks: Sequence[tuple[Task, int]],
+        tasks: Iterable[tuple[Task, int]],
         advance: Advance,
     ) -> Iterator[Result]:
         """Do the same with a function that needs the encoder."""
@@ -59,7 +63,7 @@ class LocalWorker:
         self._encoder = encoder
 
     def run(
-        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+        self, function: Callable[[Task, Advance | None], Result], tasks: Iterable[tuple[Task, int]], advance: Advance
     ) -> Iterator[Result]:
         """Yield the results in the order of the tasks."""
         for task, _ in tasks:
@@ -68,7 +72,7 @@ class LocalWorker:
     def run_encoding(
         self,
         function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
-        tasks: Sequence[tuple[Task, int]],
+        tasks: Iterable[tuple[Task, int]],
         advance: Advance,
     ) -> Iterator[Result]:
         """Yield the results in the order of the tasks."""
@@ -77,7 +81,7 @@ class LocalWorker:
 
 
 class RemoteWorkers(ABC):
-    """Works in other processes, each on one core; the largest tasks are started first."""
+    """Works in other processes, each on one core."""
 
     shared_threads = False
 
@@ -91,7 +95,7 @@ class RemoteWorkers(ABC):
             ) from error
 
     def run(
-        self, function: Callable[[Task, Advance | None], Result], tasks: Sequence[tuple[Task, int]], advance: Advance
+        self, function: Callable[[Task, Advance | None], Result], tasks: Iterable[tuple[Task, int]], advance: Advance
     ) -> Iterator[Result]:
         """Yield the results as they come."""
         return self._run(functools.partial(_call, function), tasks, advance)
@@ -99,36 +103,48 @@ class RemoteWorkers(ABC):
     def run_encoding(
         self,
         function: Callable[[Task, DescriptorEncoder, Advance | None], Result],
-        tasks: Sequence[tuple[Task, int]],
+        tasks: Iterable[tuple[Task, int]],
         advance: Advance,
     ) -> Iterator[Result]:
         """Yield the results as they come."""
         return self._run(functools.partial(_call_encoding, function, self._pickled_loader), tasks, advance)
 
-    def _run(self, function: Callable[[Any], Any], tasks: Sequence[tuple[Any, int]], advance: Advance) -> Iterator[Any]:
-        largest_first = sorted(tasks, key=lambda item: -item[1])
-        sizes = [size for _, size in largest_first]
-        for index, result in self._map(function, [task for task, _ in largest_first]):
+    def _run(self, function: Callable[[Any], Any], tasks: Iterable[tuple[Any, int]], advance: Advance) -> Iterator[Any]:
+        sizes: dict[int, int] = {}
+
+        def numbered() -> Iterator[tuple[int, Any]]:
+            for index, (task, size) in enumerate(tasks):
+                sizes[index] = size
+                yield index, task
+
+        for index, result in self._map(function, numbered()):
             yield result
-            advance(sizes[index])
+            advance(sizes.pop(index))
 
     @abstractmethod
-    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        """Yield (index of the task, result) as the results come."""
+    def _map(self, function: Callable[[Any], Any], tasks: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+        """Yield (number of the task, result) as the results come."""
 
 
 class ProcessWorkers(RemoteWorkers):
     """Works in several processes of this machine."""
 
-    def __init__(self, executor: ProcessPoolExecutor, loader: EncoderLoader) -> None:
+    def __init__(self, executor: ProcessPoolExecutor, workers: int, loader: EncoderLoader) -> None:
         super().__init__(loader)
         self._executor = executor
+        self._in_flight = 2 * workers
 
-    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        indices = {self._executor.submit(function, task): index for index, task in enumerate(tasks)}
+    def _map(self, function: Callable[[Any], Any], tasks: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+        numbers: dict[Future[Any], int] = {}
         try:
-            for future in as_completed(indices):
-                yield indices[future], future.result()
+            while True:
+                for number, task in itertools.islice(tasks, self._in_flight - len(numbers)):
+                    numbers[self._executor.submit(function, task)] = number
+                if not numbers:
+                    return
+                finished, _ = wait(numbers, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield numbers.pop(future), future.result()
         except BrokenProcessPool as error:
             raise CrossLocError(
                 "a worker process died, probably for lack of memory; what is done is kept: give the same command "
@@ -143,16 +159,25 @@ class DaskWorkers(RemoteWorkers):
         super().__init__(loader)
         self._client = client
 
-    def _map(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        from distributed import as_completed as dask_as_completed
+    def _map(self, function: Callable[[Any], Any], tasks: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, Any]]:
+        from distributed import as_completed
 
-        futures = self._client.map(function, list(tasks), pure=False)
-        indices = {future.key: index for index, future in enumerate(futures)}
-        try:
-            for future in dask_as_completed(futures):
-                yield indices[future.key], future.result()
-        finally:
-            self._client.cancel(futures)
+        in_flight = 2 * max(1, sum(self._client.nthreads().values()))
+        numbers: dict[str, int] = {}
+
+        def submit(count: int) -> list[Any]:
+            futures = []
+            for number, task in itertools.islice(tasks, count):
+                future = self._client.submit(function, task, pure=False)
+                numbers[future.key] = number
+                futures.append(future)
+            return futures
+
+        running = as_completed(submit(in_flight))
+        for future in running:
+            yield numbers.pop(future.key), future.result()
+            for following in submit(1):
+                running.add(following)
 
 
 @contextmanager
@@ -168,7 +193,7 @@ def open_workers(
             yield DaskWorkers(client, loader)
     elif workers > 1:
         with _process_pool(workers) as executor:
-            yield ProcessWorkers(executor, loader)
+            yield ProcessWorkers(executor, workers, loader)
     else:
         yield LocalWorker(encoder)
 
