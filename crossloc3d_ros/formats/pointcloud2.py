@@ -80,8 +80,12 @@ def scan_from_pointcloud2(msg: PointCloud2Like) -> Scan:
         dtypes.append(dtype)
     point_step, row_step, width, height = (int(v) for v in (msg.point_step, msg.row_step, msg.width, msg.height))
     for axis, offset, dtype in zip("xyz", offsets, dtypes, strict=True):
+        if offset < 0:
+            raise CloudError(f"field '{axis}' begins before its point, at byte {offset}")
         if offset + dtype.itemsize > point_step:
             raise CloudError(f"field '{axis}' ends at byte {offset + dtype.itemsize}, the point at {point_step}")
+    if width < 0 or height < 0:
+        raise CloudError(f"the cloud says that it has {height} x {width} points")
     stamp_ns = int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
     if width == 0 or height == 0:
         return Scan(np.empty((0, 3), np.float32), stamp_ns, str(msg.header.frame_id))
