@@ -109,7 +109,8 @@ def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch
     origin = np.array([420_000.0 + 2_000.0 * (seed % 80), 5_400_000.0 + 2_000.0 * (seed // 80 % 100), 0.0])
     return Town(
         name=f"{family} {seed}", scene=scene, terrain=terrain, clearance=clearance, preference=preference,
-        bounds=bounds, crs="EPSG:32631", origin_grid=origin, family=family, seed=seed, epoch=epoch, layout=layout,
+        bounds=bounds, crs="EPSG:32631", origin_grid=origin,
+        geoid_separation_m=0.0, family=family, seed=seed, epoch=epoch, layout=layout,
     )  # fmt: skip
 
 

@@ -41,6 +41,8 @@ class World:
     crs: str
     origin_grid: Float64Array
     """(3,) easting, northing, height in the CRS of the local zero."""
+    geoid_separation_m: float | None
+    """Ellipsoidal height minus the world's height; None where not known."""
 
     def terrain_height(self, xy: npt.NDArray[np.floating]) -> Float64Array:
         """Return the ground's height (N,) under local positions (N, 2)."""
@@ -112,11 +114,18 @@ class World:
 
 
 def free_space(
-    obstacles: BoolArray, roads: BoolArray, bounds_west_m: float, bounds_north_m: float, cell_m: float
+    obstacles: BoolArray,
+    roads: BoolArray,
+    west_m: float,
+    north_m: float,
+    cell_m: float,
+    *,
+    least_share: float = 0.05,
 ) -> tuple[Raster, Raster]:
     """Return clearance and preference from masks of cells (row 0 = north).
 
-    What hangs together with no road, keeping a metre on either side, is not preferred at all: closed courtyards.
+    What hangs together with no road, keeping a metre on either side, is not preferred at all: closed courtyards. Nor
+    are regions whose roads have less than `least_share` of the largest region's.
     """
     padded = np.pad(obstacles, 1, constant_values=True)
     distance = ndimage.distance_transform_edt(~padded)[1:-1, 1:-1] * cell_m
@@ -132,12 +141,12 @@ def free_space(
             votes = np.bincount(regions.ravel(), minlength=count + 1)
             votes[0] = 0
         # Quarters on either side of a river are both real places; a strip between two fences is none.
-        reachable = (votes >= max(1.0, 0.05 * votes.max()))[regions]
+        reachable = (votes >= max(1.0, least_share * votes.max()))[regions]
         preference[reachable] = 0.2
         preference[reachable & roads] = 1.0
     return (
-        Raster(clearance, bounds_west_m, bounds_north_m, cell_m),
-        Raster(preference, bounds_west_m, bounds_north_m, cell_m),
+        Raster(clearance, west_m, north_m, cell_m),
+        Raster(preference, west_m, north_m, cell_m),
     )
 
 
