@@ -125,7 +125,7 @@ def test_a_submap_takes_a_few_milliseconds() -> None:
     cutter.cut(centres[0])
     seconds = []
     for centre in centres[:40]:
-        start = time.perf_counter()
+        start = time.thread_time()
         assert cutter.cut(centre) is not None
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.thread_time() - start)
     assert min(seconds) < 0.005
