@@ -329,7 +329,7 @@ def _point(place: Float64Array) -> dict[str, Any] | None:
 
 def _track(truth: Float64Array) -> dict[str, Any]:
     """Return the geometry of a track (n, 2): a line for each stretch without gaps, points for what stands alone."""
-    known: BoolArray = np.isfinite(truth).all(axis=1)
+    known = np.asarray(np.isfinite(truth).all(axis=1), dtype=np.bool_)
     pieces = np.split(np.arange(len(truth)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
     stretches = [[_position(truth[i]) for i in piece] for piece in pieces if known[piece[0]]]
     lines = [stretch for stretch in stretches if len(stretch) > 1]
