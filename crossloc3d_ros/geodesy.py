@@ -83,11 +83,11 @@ def utm_crs_of(crs: str, x: float, y: float) -> CRS:
     Raises AerialDataError where the place is not on Earth: the CRS is the wrong one then.
     """
     longitude, latitude = _transformer(crs, _WGS84_3D).transform(x, y)
-    if not (math.isfinite(longitude) and math.isfinite(latitude)):
+    if not (abs(longitude) <= 360.0 and abs(latitude) <= 90.0):
         raise AerialDataError(
-            f"the coordinates ({x:.7g}, {y:.7g}) do not fit the CRS {crs_name(crs)}; give it with --crs"
+            f"the coordinates ({x:.7g}, {y:.7g}) do not fit the CRS {crs_name(crs)}; say the right one with --crs"
         )
-    return utm_crs_for(longitude, latitude)
+    return utm_crs_for((longitude + 180.0) % 360.0 - 180.0, latitude)
 
 
 def same_crs(first: str, second: str) -> bool:
