@@ -1,0 +1,326 @@
+"""`replay`: a recording through the localizer, or into ROS."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from crossloc3d_ros.cli.common import (
+    EXIT_INTERRUPTED,
+    ProgressDisplay,
+    add_options,
+    add_verbosity,
+    console,
+    run,
+    set_up_logging,
+)
+from crossloc3d_ros.config import LocalizerNodeConfig, MountingConfig, from_dict
+from crossloc3d_ros.encoder.checkpoint import load_encoder
+from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
+from crossloc3d_ros.evaluation.recall import RADII_M, RANKS
+from crossloc3d_ros.evaluation.replay import (
+    ESTIMATES,
+    GEOJSON,
+    SUMMARY,
+    Evaluation,
+    evaluate,
+    latency_summary,
+    localize_bag,
+    write_summary,
+)
+from crossloc3d_ros.evaluation.report import About, write_report
+from crossloc3d_ros.evaluation.truth import find_truth_topic
+from crossloc3d_ros.formats.bag import IMU, POINT_CLOUD, BagReader, open_bag
+from crossloc3d_ros.localization.localizer import Localizer
+from crossloc3d_ros.places.store import AerialMap
+
+PAGE = "index.html"
+ROS_ARGUMENTS = "--ros-args"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    at = given.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in given else len(given)
+    parser = _parser()
+    arguments = parser.parse_args(given[:at])
+    ros_arguments = [argument for argument in given[at + 1 :] if argument != "--"]
+    if arguments.publish:
+        return run(lambda: _publish(arguments, ros_arguments))
+    if ros_arguments:
+        parser.error(f"{ROS_ARGUMENTS} has a meaning with --publish only")
+    if arguments.map is None:
+        parser.error("--map is needed, the folder that build_map wrote (or --publish, to play into ROS)")
+    return run(lambda: _replay(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="replay",
+        description="Localize every scan of a recording and score the fixes against its GNSS; or play the recording "
+        "into ROS with its own timing, where 'ros2 bag' is not at hand.",
+        epilog="With --publish, remappings may follow: --ros-args -r /velodyne_points:=/points",
+    )
+    parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag")
+    parser.add_argument("--topic", help="topic with the clouds (default: the only PointCloud2 topic)")
+    add_verbosity(parser)
+
+    localize = parser.add_argument_group("localize and score")
+    localize.add_argument("--map", type=Path, help="folder of the aerial map")
+    localize.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
+    localize.add_argument("--device", default="cpu", help="where to encode: cpu or cuda (default: %(default)s)")
+    localize.add_argument("--gnss-topic", help="NavSatFix topic to score against (default: ground truth, or the only)")
+    localize.add_argument("--imu-topic", help="Imu topic, axes of the base, to level the scans by (default: none)")
+    localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
+    localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
+    localize.add_argument("--config", type=Path, help="parameter file of the localizer node, such as localizer.yaml")
+
+    mounting = parser.add_argument_group("mounting of the lidar on the robot (stronger than --config)")
+    add_options(mounting, MountingConfig)  # type: ignore[arg-type]  # a group takes arguments as a parser does
+
+    publish = parser.add_argument_group("play into ROS")
+    publish.add_argument("--publish", action="store_true", help="play the messages instead of localizing here")
+    publish.add_argument("--rate", type=float, default=1.0, help="speed (default: %(default)s)")
+    publish.add_argument("--clock", action="store_true", help="publish /clock, for nodes with use_sim_time")
+    publish.add_argument("--loop", action="store_true", help="start again at the end, until Ctrl-C")
+    publish.add_argument("--wait-s", type=float, default=30.0, help="wait for a subscriber; 0 = do not (default: 30)")
+    publish.add_argument("--play-topics", nargs="+", metavar="TOPIC", help="play these alone (default: all)")
+    return parser
+
+
+# Localize and score
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    if arguments.every < 1:
+        raise ConfigError(f"--every must be at least 1, got {arguments.every}")
+    target = console()
+    set_up_logging(arguments.verbose, target)
+    config = read_config(arguments.config, _mounting_of(arguments))
+    folder = arguments.output or Path("out") / "replay" / arguments.bag.resolve().stem
+    broken: BagError | None = None
+    interrupted = False
+    with open_bag(arguments.bag) as bag:
+        # Everything that can be refused is refused before the long work begins.
+        topic = choose_cloud_topic(bag, arguments.topic)
+        find_truth_topic(bag, arguments.gnss_topic)
+        if arguments.imu_topic is not None:
+            bag.topic(arguments.imu_topic, IMU)
+        encoder = load_encoder(arguments.weights, device=arguments.device)
+        aerial_map = AerialMap.load(arguments.map, encoder.fingerprint)
+        localizer = Localizer(aerial_map, encoder, config)
+        remove_results(folder)
+        target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps")
+        localizer.warm_up()
+        with ProgressDisplay(target) as display:
+            try:
+                localize_bag(
+                    bag,
+                    topic,
+                    localizer,
+                    folder / ESTIMATES,
+                    every=arguments.every,
+                    imu_topic=arguments.imu_topic,
+                    imu_time_constant_s=config.imu_time_constant_s,
+                    progress=lambda done, total, _: display("localize", done, total, "scans"),
+                )
+            except BagError as error:
+                broken = error  # what was read before the damage is worth its figures
+            except KeyboardInterrupt:
+                interrupted = True
+                target.print("interrupted: writing up what there is; Ctrl-C once more to leave it")
+        if not _has_rows(folder / ESTIMATES):
+            if broken is not None:
+                raise broken
+            return EXIT_INTERRUPTED
+        evaluation = evaluate(bag, folder, aerial_map, arguments.gnss_topic)
+    facts = {
+        "bag": str(arguments.bag),
+        "topic": topic,
+        "map": str(arguments.map),
+        "weights": encoder.fingerprint[:12],
+        "run": "straight through the localizer",
+    }
+    notes = []
+    if broken is not None:
+        notes.append(f"The recording is damaged; only the part before the damage is shown. {broken}")
+    if interrupted:
+        notes.append("The run was interrupted; only the scans before that are shown.")
+    write_results(folder, evaluation, aerial_map, About(f"Replay of {arguments.bag.name}", facts, tuple(notes)))
+    Console(highlight=False).print(results_table(evaluation))
+    print(f"{folder / PAGE}\n{folder / ESTIMATES}\n{folder / GEOJSON}")
+    if broken is not None:
+        raise broken
+    return EXIT_INTERRUPTED if interrupted else 0
+
+
+def choose_cloud_topic(bag: BagReader, chosen: str | None) -> str:
+    """Return the topic with the clouds: the chosen one, or the only one there is; BagError lists the topics."""
+    if chosen is not None:
+        return bag.topic(chosen, POINT_CLOUD).name
+    return bag.only_topic(POINT_CLOUD, "choose one with --topic").name
+
+
+def remove_results(folder: Path) -> None:
+    """Remove an earlier run's results, so that old figures never stand beside new ones."""
+    for name in (ESTIMATES, GEOJSON, SUMMARY, PAGE):
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise CrossLocError(f"cannot write into {folder}: {error}") from error
+
+
+def write_results(folder: Path, evaluation: Evaluation, aerial_map: AerialMap, about: About) -> None:
+    """Write summary and page into the folder of the estimates."""
+    write_summary(folder, evaluation, {**about.facts, "notes": list(about.notes)})
+    if not about.footer:
+        today = datetime.datetime.now(datetime.UTC).date().isoformat()
+        about = About(**{**vars(about), "footer": f"Written by crossloc3d_ros {own_version()} on {today}."})
+    write_report(folder / PAGE, evaluation, aerial_map, about)
+
+
+def results_table(evaluation: Evaluation) -> Table:
+    """Return the scores as a table for the terminal."""
+    table, scores = evaluation.table, evaluation.scores
+    result = Table(title="Results", title_justify="left", show_header=False, pad_edge=False)
+    result.add_column(style="bold")
+    result.add_column()
+    fixes = int(table.has_fix.sum())
+    result.add_row("scans", f"{len(table):,}, of which {fixes:,} led to a fix ({fixes / max(len(table), 1):.0%})")
+    latency = latency_summary(table)
+    if latency:
+        result.add_row("time a scan", f"median {latency['median']:.1f} ms, 95 % {latency['p95']:.1f} ms")
+    if scores is None:
+        result.add_row("errors", "not known: the recording has no usable GNSS at the time of the scans")
+        return result
+    error, first = scores.fix_error, scores.best_candidate_error
+    if error.count:
+        result.add_row("error of a fix", f"median {error.median_m:.0f} m, 95 % {error.p95_m:.0f} m")
+        result.add_row("truth in 95 % ellipse", f"{error.within_ellipse:.0%} of the fixes")
+    if first.count:
+        result.add_row("error of first candidate", f"median {first.median_m:.0f} m, 95 % {first.p95_m:.0f} m")
+    for rank in RANKS:
+        cells = [scores.recall(rank, radius) for radius in RADII_M]
+        text = "   ".join(
+            f"{cell.share.value:4.0%} within {cell.radius_m:g} m (by lot {cell.chance:.0%})" for cell in cells
+        )
+        result.add_row(f"AR@{rank}", text)
+    result.add_row("evidence", f"{scores.places} places at least 25 m apart")
+    return result
+
+
+def read_config(path: Path | None, mounting: Mapping[str, float]) -> LocalizerNodeConfig:
+    """Return the localizer's settings from a node's parameter file, the mounting given on the command line on top.
+
+    Understands `ros__parameters` under the node's name or a wildcard, nested or with dots; ConfigError names what is
+    wrong.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise ConfigError(f"cannot read {path}: {error}") from error
+        values = _parameters_of(document, path)
+    if mounting:
+        scan = values.setdefault("scan", {})
+        scan["mounting"] = {**scan.get("mounting", {}), **mounting}
+    return from_dict(LocalizerNodeConfig, values)
+
+
+def _parameters_of(document: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path} holds no parameters")
+    merged: dict[str, Any] = {}
+    for node, content in document.items():
+        if isinstance(content, dict) and "ros__parameters" in content:
+            if node in ("localizer", "/localizer", "/**", "/*"):
+                _merge(merged, content["ros__parameters"] or {})
+        else:
+            raise ConfigError(f"{path}: '{node}' has no 'ros__parameters'; write 'localizer: ros__parameters: ...'")
+    # What any node may be told has no meaning without a node.
+    return {key: value for key, value in merged.items() if key not in ("use_sim_time", "qos_overrides")}
+
+
+def _merge(target: dict[str, Any], source: Mapping[str, Any]) -> None:
+    for key, value in source.items():
+        head, _, rest = str(key).partition(".")
+        if rest:
+            value = {rest: value}
+        if isinstance(value, Mapping):
+            group = target.setdefault(head, {})
+            if isinstance(group, dict):
+                _merge(group, value)
+                continue
+        target[head] = value
+
+
+def _mounting_of(arguments: argparse.Namespace) -> dict[str, float]:
+    names = MountingConfig.__dataclass_fields__
+    return {name: vars(arguments)[name] for name in names if vars(arguments).get(name) is not None}
+
+
+def own_version() -> str:
+    """Return the version of the package."""
+    try:
+        return version("crossloc3d_ros")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _has_rows(path: Path) -> bool:
+    try:
+        with path.open(encoding="utf-8") as file:
+            return sum(1 for _, _ in zip(file, range(2), strict=False)) == 2
+    except OSError:
+        return False
+
+
+# Play into ROS
+
+
+def _publish(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> None:
+    target = console()
+    set_up_logging(arguments.verbose, target)
+    try:
+        from crossloc3d_ros.ros.player import PlayerConfig, play_bag
+    except ImportError as error:
+        raise CrossLocError(
+            f"ROS 2 was not found ({error}): source /opt/ros/jazzy/setup.bash, or pip install ros-jazzy-rclpy "
+            "ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
+        ) from error
+    config = from_dict(
+        PlayerConfig,
+        {name: getattr(arguments, name) for name in ("rate", "clock", "loop", "wait_s")},
+    )
+    with open_bag(arguments.bag) as bag:
+        if arguments.topic is not None:
+            bag.topic(arguments.topic, POINT_CLOUD)
+        seconds = (bag.end_ns - bag.start_ns) / 1e9 / config.rate
+        target.print(f"{shlex.quote(str(arguments.bag))}: {bag.message_count:,} messages, {seconds:.1f} s at this rate")
+        target.print("waiting for a subscriber")
+        report = play_bag(
+            bag,
+            config,
+            topics=arguments.play_topics,
+            ros_arguments=ros_arguments,
+            on_ready=lambda: target.print("playing"),
+        )
+    print(
+        f"{report.messages:,} messages in {report.duration_s:.1f} s, late by {report.late_median_ms:.2f} ms in the "
+        f"median, {report.late_p99_ms:.2f} ms at 99 %"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
