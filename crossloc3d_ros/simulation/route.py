@@ -69,7 +69,7 @@ def plan_route(
     rng: np.random.Generator,
     *,
     clearance_m: float = 1.5,
-    border_m: float = 40.0,
+    border_m: float = 25.0,
     speed_m_s: float = 2.0,
     rate_hz: float = 50.0,
     tilt_deg: float = 0.6,
@@ -80,7 +80,9 @@ def plan_route(
     of the slope. Streets are driven again where the world is too small for the length. Raises RouteError where no
     connected free ground of at least 60 m extent is left.
     """
-    path = _smooth(_plan_path(world, length_m, rng, clearance_m, border_m), world, clearance_m)
+    # A little more than asked for, because the robot cuts its corners a little.
+    room = clearance_m + 0.2
+    path = _smooth(_plan_path(world, length_m, rng, room, border_m), world, room)
     xy, yaw = _follow(path, length_m, speed_m_s, rate_hz)
     sway = math.radians(tilt_deg)
     noise = rng.standard_normal((2, len(xy)))
