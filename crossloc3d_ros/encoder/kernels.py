@@ -25,6 +25,9 @@ COLUMNS = 16
 UNROLL = 4
 """Input channels that the register tile takes at a time."""
 
+OUTER_BLOCK = 64
+"""Pairs that the gradient of the weights takes at a time, so that both sides stay in the cache."""
+
 MAX_DENSE_CELLS = 1 << 24
 """Largest bounding box (in cells) that is looked up in a dense table; beyond it sorted keys are searched."""
 
@@ -289,6 +292,45 @@ def dense_product(x: Any, packed: Any, out: Any, begin: int, end: int) -> None:
         begin,
         end,
     )
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def gather_outer(x: Any, grad: Any, in_rows: Any, out_rows: Any, first: Any, out: Any) -> None:
+    """Add `x[i].T @ grad[o]` over the pairs (i, o) of each kernel k to out[k]: the gradient of the weights.
+
+    x (N, Cin) and grad (M, Cout) float32, C-contiguous; out (K, Cin, Cout); Cout a multiple of 16.
+    """
+    depth, width = x.shape[1], grad.shape[1]
+    turned = np.empty((depth, OUTER_BLOCK), np.float32)
+    gathered = np.empty((OUTER_BLOCK, width), np.float32)
+    for k in range(len(first) - 1):
+        target = out[k].ravel()
+        for start in range(first[k], first[k + 1], OUTER_BLOCK):
+            count = min(OUTER_BLOCK, first[k + 1] - start)
+            for p in range(count):
+                row = in_rows[start + p]
+                for c in range(depth):
+                    turned[c, p] = x[row, c]
+                row = out_rows[start + p]
+                for c in range(width):
+                    gathered[p, c] = grad[row, c]
+            strided_product(
+                turned.ravel(),
+                0,
+                OUTER_BLOCK,
+                1,
+                gathered.ravel(),
+                0,
+                COLUMNS,
+                width,
+                target,
+                0,
+                width,
+                count,
+                width,
+                0,
+                depth,
+            )
 
 
 @njit(cache=True, nogil=True, boundscheck=False)

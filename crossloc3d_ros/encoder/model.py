@@ -215,10 +215,12 @@ class NetVlad(nn.Module):
 
     def forward(self, x: Tensor, starts: Tensor) -> Tensor:
         soft = torch.softmax(self.assignment_norm(x @ self.assignment), dim=1)  # (N, K)
-        pooled = []
-        for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-            a = soft[begin:end]
-            pooled.append(x[begin:end].t() @ a - a.sum(dim=0) * self.centers)
+        counts = (starts[1:] - starts[:-1]).tolist()
+        # split, not slices: the gradient of a slice is as large as the whole batch
+        pooled = [
+            y.t() @ a - a.sum(dim=0) * self.centers
+            for y, a in zip(torch.split(x, counts), torch.split(soft, counts), strict=True)
+        ]
         residuals = F.normalize(torch.stack(pooled), dim=1, eps=1e-12)  # (B, C, K), each cluster's column
         flat = F.normalize(residuals.flatten(1), dim=1, eps=1e-12)
         y = self.output_norm(flat @ self.projection)

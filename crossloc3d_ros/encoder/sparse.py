@@ -144,7 +144,7 @@ def search_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> Kernel
 def _accumulate(x: Tensor, weight: Tensor, in_rows: Tensor, out_rows: Tensor, first: tuple[int, ...], n: int) -> Tensor:
     """Return `out[o] = sum_k x[i] @ weight[k]` over the pairs of each kernel k; out (n, Cout)."""
     out = x.new_zeros(n, weight.shape[2])
-    if x.device.type == "cpu" and x.dtype == torch.float32 and weight.shape[2] % kernels.COLUMNS == 0:
+    if _is_compiled(x, weight):
         bounds = np.asarray(first)
         kernels.gather_product(
             x.detach().contiguous().numpy(),
@@ -161,6 +161,32 @@ def _accumulate(x: Tensor, weight: Tensor, in_rows: Tensor, out_rows: Tensor, fi
         if begin < end:
             out.index_add_(0, out_rows[begin:end], x.index_select(0, in_rows[begin:end]) @ weight[k])
     return out
+
+
+def _weight_gradient(x: Tensor, grad: Tensor, weight: Tensor, pairs: KernelMap) -> Tensor:
+    """Return `sum x[i].T @ grad[o]` over the pairs of each kernel; the shape of the weight."""
+    out = torch.zeros_like(weight, memory_format=torch.contiguous_format)
+    if _is_compiled(x, weight):
+        kernels.gather_outer(
+            x.detach().contiguous().numpy(),
+            grad.numpy(),
+            pairs.in_rows.numpy(),
+            pairs.out_rows.numpy(),
+            np.asarray(pairs.first),
+            out.numpy(),
+        )
+        return out
+    for k in range(len(pairs.first) - 1):
+        begin, end = pairs.first[k], pairs.first[k + 1]
+        if begin < end:
+            inputs = x.index_select(0, pairs.in_rows[begin:end])
+            torch.mm(inputs.t(), grad.index_select(0, pairs.out_rows[begin:end]), out=out[k])
+    return out
+
+
+def _is_compiled(x: Tensor, weight: Tensor) -> bool:
+    """Say whether the compiled kernels can do the work."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and weight.shape[2] % kernels.COLUMNS == 0
 
 
 class _SparseConvolution(torch.autograd.Function):
@@ -181,15 +207,7 @@ class _SparseConvolution(torch.autograd.Function):
             transposed = weight.transpose(1, 2).contiguous()
             grad_x = _accumulate(grad, transposed, pairs.out_rows, pairs.in_rows, pairs.first, pairs.n_inputs)
         if ctx.needs_input_grad[1]:
-            grad_weight = torch.zeros_like(weight)
-            for k in range(len(pairs.first) - 1):
-                begin, end = pairs.first[k], pairs.first[k + 1]
-                if begin < end:
-                    torch.mm(
-                        x.index_select(0, pairs.in_rows[begin:end]).t(),
-                        grad.index_select(0, pairs.out_rows[begin:end]),
-                        out=grad_weight[k],
-                    )
+            grad_weight = _weight_gradient(x, grad, weight, pairs)
         return grad_x, grad_weight, None
 
 

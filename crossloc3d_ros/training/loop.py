@@ -20,6 +20,7 @@ from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loss import BatchHardTriplet, InfoNCE
+from crossloc3d_ros.training.memory import keep_freed_memory
 from crossloc3d_ros.training.model_card import model_card
 from crossloc3d_ros.training.sampling import BatchSampler
 from crossloc3d_ros.training.shards import (
@@ -38,7 +39,7 @@ from crossloc3d_ros.types import Float32Array
 logger = logging.getLogger(__name__)
 
 _ENCODE_BATCH = 32
-_NORM_BATCHES = 16
+_NORM_BATCHES = 8
 _NORM_STEP = 2**40  # batches for the norm statistics come from beyond any run's own
 _MOST_BAD_STEPS = 20
 
@@ -140,6 +141,7 @@ class Trainer:
         """
         config = self.config
         torch.set_num_threads(config.threads)
+        keep_freed_memory()
         manifest = read_manifest(self.places)
         run_folder.prepare(self.folder, config, manifest, self.places, resume=resume)
         sampler = BatchSampler([read_training_town(self.places / t.file) for t in manifest.of_role(TRAINING)], config)
@@ -352,4 +354,4 @@ def _tensors(clouds: Sequence[Float32Array], device: str) -> list[Tensor]:
 
 
 def _scale(criterion: nn.Module) -> float | None:
-    return round(float(criterion.log_scale.exp()), 3) if isinstance(criterion, InfoNCE) else None
+    return round(criterion.log_scale.exp().item(), 3) if isinstance(criterion, InfoNCE) else None
