@@ -39,8 +39,7 @@ def _import(arguments: argparse.Namespace) -> int:
 
     model = read_release(arguments.checkpoint, PRESETS[arguments.preset])
     source = {"training": f"imported from {arguments.checkpoint.name}"}
-    dtype = "float32" if arguments.float32 else "float16"
-    save_checkpoint(arguments.output, model, PUBLISHED, source, dtype=dtype)
+    save_checkpoint(arguments.output, model, PUBLISHED, source, dtype="float32" if arguments.float32 else "float16")
     written = load_checkpoint(arguments.output)
     parameters = sum(p.numel() for p in written.model.parameters())
     print(f"wrote {arguments.output}: {parameters:,} parameters, fingerprint {written.fingerprint}")
