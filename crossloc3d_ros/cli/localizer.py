@@ -47,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"ROS 2 was not found (no module '{error.name}'): source /opt/ros/jazzy/setup.bash, or "
                 "pip install ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
             ) from error
+        except KeyboardInterrupt:
+            return 0  # a node that is told to stop has done nothing wrong, however early it is told
         return run_localizer(arguments)
 
     return common.run(action)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 import signal
@@ -34,7 +35,6 @@ from std_srvs.srv import Empty
 from visualization_msgs.msg import MarkerArray
 
 from crossloc3d_ros.config import LocalizerNodeConfig
-from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.localization.gravity import GravityFilter
@@ -69,6 +69,9 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     """Load weights and map and bring them together; raises CrossLocError saying what is missing."""
     if not config.map:
         raise ConfigError("parameter 'map' is empty: give the folder of an aerial map, as build_map writes it")
+    # Late, because torch takes seconds: wrong parameters are refused and the node is on the graph before.
+    from crossloc3d_ros.encoder.checkpoint import load_encoder
+
     encoder = load_encoder(Path(config.weights) if config.weights else None, device=config.device)
     return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
 
@@ -165,8 +168,6 @@ class LocalizerNode(LifecycleNode):
             step()
         except CrossLocError as error:
             self._complaint = " ".join(str(error).split())
-        except InvalidQosOverridesError as error:
-            self._complaint = f"qos_overrides.{self._points_topic}: {error}"
         except Exception as error:
             self._complaint = f"{type(error).__name__}: {error}"
             logging.getLogger(__name__).exception("the localizer could not start")
@@ -214,26 +215,31 @@ class LocalizerNode(LifecycleNode):
         self._worker.start(localizer.warm_up)
         self._statistics.reset()
         self._last_status = None
-        self._inputs = [
-            self.create_subscription(
-                PointCloud2,
-                "points",
-                self._receive,
-                qos_profile_sensor_data,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                event_callbacks=SubscriptionEventCallbacks(
-                    incompatible_qos=self._on_incompatible_qos, message_lost=self._on_message_lost
-                ),
-            )
-        ]
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=self._on_incompatible_qos, message_lost=self._on_message_lost
+        )
+        self._listen(PointCloud2, "points", self._receive, events)
         if self._config.use_imu:
-            options = QoSOverridingOptions.with_default_policies()
-            self._inputs.append(
-                self.create_subscription(
-                    Imu, "imu", self._receive_imu, qos_profile_sensor_data, qos_overriding_options=options
-                )
-            )
+            self._listen(Imu, "imu", self._receive_imu)
         self.get_logger().info(f"warm after {time.monotonic() - started:.1f} s; listening on {self._points_topic}")
+
+    def _listen(
+        self, kind: type, topic: str, callback: Callable[[Any], None], events: SubscriptionEventCallbacks | None = None
+    ) -> None:
+        """Subscribe as sensors publish, or as the user has overridden it."""
+        options = QoSOverridingOptions.with_default_policies()
+        try:
+            subscription = self.create_subscription(
+                kind,
+                topic,
+                callback,
+                copy.copy(qos_profile_sensor_data),  # rclpy writes the overrides into the profile that it is given
+                qos_overriding_options=options,
+                event_callbacks=events,
+            )
+        except (InvalidQosOverridesError, RuntimeError, TypeError, ValueError) as error:
+            raise ConfigError(f"qos_overrides.{self.resolve_topic_name(topic)}.subscription: {error}") from error
+        self._inputs.append(subscription)
 
     def _stop_listening(self) -> bool:
         """Take no more clouds and wait for the worker; return whether it has ended."""

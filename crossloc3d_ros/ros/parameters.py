@@ -75,7 +75,7 @@ class ConfigParameters(Generic[T]):
         return from_dict(self._kind, _nested({name: self._value(name) for name in self._settings}))
 
     def _overrides(self) -> dict[str, Any]:
-        given = {name: self._value(name) for name in self._node.list_parameters([], 0).result.names}
+        given = {name: self._value(name) for name in self._node.list_parameters([], 0).names}
         unknown = [name for name in given if name not in self._settings and not self._is_ros_own(name)]
         if unknown:
             raise ConfigError("; ".join(self._unknown(name) for name in unknown))

@@ -1,0 +1,437 @@
+"""The localizer as a real process over DDS: what goes in, what comes out, and what must not stop it."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus, PointCloud2
+from std_srvs.srv import Empty
+
+from crossloc3d_ros.formats.bag import open_bag
+from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
+from crossloc3d_ros.geodesy import MapFrame
+
+if TYPE_CHECKING:
+    from conftest import NodeProcess, Robot, StartNode, World
+
+
+@pytest.fixture(scope="module")
+def localizer(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
+    """One node for all tests that leave it as they find it: active, with its own settings."""
+    node = start_node(world.parameters())
+    node.wait_for_output("listening on /points")
+    yield node
+    assert node.is_alive, f"a test has ended the node:\n{node.output}"
+    assert node.stop() == 0
+    assert "Traceback" not in node.output
+
+
+@pytest.fixture
+def active(localizer: NodeProcess, robot: Robot) -> Robot:
+    robot.wait_for_localizer()
+    return robot
+
+
+def test_a_cloud_becomes_a_fix_by_every_convention(active: Robot, world: World) -> None:
+    message = active.message(world.points(7))
+    fix = active.localize(message)
+    assert fix.status.status == NavSatStatus.STATUS_FIX
+    assert fix.header.stamp == message.header.stamp
+    assert fix.header.frame_id == "base_link", "the frame whose position is given, not the map's"
+    latitude, longitude = world.latitude_longitude(7)
+    assert fix.latitude == pytest.approx(latitude, abs=1e-6)
+    assert fix.longitude == pytest.approx(longitude, abs=1e-6)
+    assert fix.altitude == pytest.approx(world.grid(7)[2], abs=0.01)
+    assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_APPROXIMATED
+    covariance = np.array(fix.position_covariance).reshape(3, 3)
+    assert np.linalg.eigvalsh(covariance[:2, :2]).min() >= 25.0**2 - 1e-6
+
+
+def test_the_pose_lies_in_the_map_frame_whose_origin_is_latched(active: Robot, world: World) -> None:
+    active.wait_until(lambda: active.origins, what="for the map's origin")
+    origin = active.origins[-1]
+    assert origin.header.frame_id == "map"
+    fix = active.localize(world.points(8))
+    active.wait_until(lambda: active.poses and active.poses[-1].header.stamp == fix.header.stamp, what="for the pose")
+    pose = active.poses[-1]
+    assert pose.header.frame_id == "map"
+    frame = MapFrame("EPSG:32631", np.array(world.grid(0)), 0.0)
+    at_origin = frame.from_geographic(np.array([origin.latitude]), np.array([origin.longitude]))
+    np.testing.assert_allclose(at_origin[0, :2], world.grid(0)[:2], atol=1e-3)
+    position = pose.pose.pose.position
+    expected = frame.to_enu(np.array([world.grid(8)]))[0]
+    np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=0.05)
+    covariance = np.array(pose.pose.covariance).reshape(6, 6)
+    assert covariance[5, 5] > 1e3, "the heading is not known"
+    np.testing.assert_allclose(covariance[:3, :3].ravel(), fix.position_covariance)
+
+
+def test_the_candidates_come_as_poses_as_a_table_and_as_markers(active: Robot, world: World) -> None:
+    fix = active.localize(world.points(9))
+    outputs = (active.candidates, active.tables)
+    active.wait_until(lambda: all(o and o[-1].header.stamp == fix.header.stamp for o in outputs), what="for candidates")
+    table = active.tables[-1]
+    dtype = np.dtype(
+        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("latitude", "<f8"), ("longitude", "<f8"),
+         ("descriptor_distance", "<f4"), ("probability", "<f4"), ("submap_id", "<i4")]
+    )  # fmt: skip
+    assert [(f.name, f.offset) for f in table.fields] == [(n, dtype.fields[n][1]) for n in dtype.names]
+    rows = np.frombuffer(bytes(table.data), dtype)
+    assert len(rows) == table.width == 25
+    assert (np.diff(rows["descriptor_distance"]) >= 0).all()
+    assert rows["submap_id"][0] == 9
+    assert rows["probability"].sum() == pytest.approx(1.0, abs=0.01)
+    assert rows["latitude"][0] == pytest.approx(world.latitude_longitude(9)[0], abs=1e-9)
+    poses = active.candidates[-1]
+    assert poses.header.frame_id == table.header.frame_id == "map"
+    np.testing.assert_allclose([p.position.x for p in poses.poses], rows["x"], atol=1e-3)
+    active.wait_until(lambda: active.markers, what="for markers")
+    assert len(active.markers[-1].markers) == 1 + 25 + 2
+    assert any("of 25 candidates lie at one place" in m.text for m in active.markers[-1].markers)
+
+
+def spoil(message: PointCloud2, how: str) -> PointCloud2:
+    """Make a good cloud bad."""
+    xyz = slice(0, 12)
+    raw = np.frombuffer(bytes(message.data), np.uint8).reshape(message.width, message.point_step).copy()
+    if how == "a field of integers":
+        message.fields[0].datatype = 5
+    elif how == "no z":
+        message.fields[2].name = "height"
+    elif how == "cut short":
+        raw = raw[:-100]
+    elif how == "empty":
+        message.width, message.row_step = 0, 0
+        raw = raw[:0]
+    elif how == "twelve points":
+        message.width, message.row_step = 12, 12 * message.point_step
+        raw = raw[:12]
+    elif how == "all NaN":
+        raw[:, xyz] = np.full(3, np.nan, np.float32).view(np.uint8)
+    elif how == "points 1e30 m away":
+        raw[:, xyz] = np.full(3, 1e30, np.float32).view(np.uint8)
+    message.data = raw.tobytes()
+    return message
+
+
+@pytest.mark.parametrize(
+    ("how", "level", "reason"),
+    [
+        ("empty", 1, "the scan is empty"),
+        ("twelve points", 1, "12 of 12 points left"),
+        ("all NaN", 1, "0 of 14,400 points left after filtering"),
+        ("points 1e30 m away", 1, "0 of 14,400 points left after filtering"),
+        ("a field of integers", 2, "field 'x' is int32"),
+        ("no z", 2, "no field 'z'"),
+        ("cut short", 2, "cut short"),
+    ],
+)
+def test_a_bad_cloud_gives_no_fix_a_reason_and_no_harm(
+    active: Robot, world: World, how: str, level: int, reason: str
+) -> None:
+    fix = active.localize(spoil(active.message(world.points(1)), how))
+    assert fix.status.status == NavSatStatus.STATUS_NO_FIX
+    assert math.isnan(fix.latitude)
+    assert math.isnan(fix.longitude)
+    assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN
+    told, message, values = active.diagnosis()
+    assert (told, values["last reason"]) == (level, message)
+    assert reason in message
+    assert not [p for p in active.poses if p.header.stamp == fix.header.stamp], "a pose without a fix"
+    assert active.localize(world.points(1)).status.status == NavSatStatus.STATUS_FIX
+
+
+@pytest.mark.parametrize(
+    "bag",
+    ["einride_vlp16_pointcloud2_mcap", "nebula_vlp16_pointcloud2_mcap", "tepic_vlp16_outdoor_1scan_pointcloud2_mcap"],
+)
+def test_real_velodyne_messages_are_read_and_found_nowhere(active: Robot, shared: Any, bag: str) -> None:
+    with open_bag(shared(f"data/vlp16/{bag}")) as reader:
+        topic = reader.only_topic("sensor_msgs/msg/PointCloud2", "")
+        raw = next(iter(reader.raw_messages([topic.name])))
+        recorded = next(iter(reader.messages([topic.name]))).message
+    publisher = active.clouds
+    deadline = time.monotonic() + 15.0
+    stamp = recorded.header.stamp
+    found: list[NavSatFix] = []
+    while not found and time.monotonic() < deadline:
+        publisher.publish(bytes(raw.cdr))
+        active.spin(0.3)
+        found = [f for f in active.fixes if (f.header.stamp.sec, f.header.stamp.nanosec) == (stamp.sec, stamp.nanosec)]
+    assert found, "no answer to a real cloud"
+    assert found[-1].status.status == NavSatStatus.STATUS_NO_FIX
+    level, _, values = active.diagnosis()
+    assert level == 1
+    assert f"received {len(scan_from_pointcloud2(recorded).points)}," in values["last points"]
+
+
+def test_what_is_dropped_is_counted_and_the_newest_is_worked_on(active: Robot, world: World) -> None:
+    before = active.diagnosis()[2]
+    messages = [active.message(world.points(place)) for place in range(20)] * 3
+    for message in messages:
+        active.clouds.publish(message)
+    last = messages[-1].header.stamp
+    active.wait_until(lambda: any(f.header.stamp == last for f in active.fixes), what="for the newest scan")
+    active.spin(1.1)
+    after = active.diagnosis()[2]
+    received, processed, dropped = (
+        int(after[name]) - int(before[name]) for name in ("clouds received", "clouds processed", "clouds dropped")
+    )
+    assert received == processed + dropped
+    assert dropped > 0
+    assert processed < len(messages)
+
+
+def test_the_diagnostics_say_what_the_node_works_with(active: Robot, world: World) -> None:
+    active.localize(world.points(2))
+    level, message, values = active.diagnosis()
+    assert level == 0, message
+    assert values["map"] == str(world.map_path)
+    assert values["submaps"] == "30"
+    assert len(values["encoder"]) == 16
+    assert 0 < float(values["latency median (ms)"]) <= float(values["latency max (ms)"])
+    active.spin(3.2)
+    level, message, _ = active.diagnosis()
+    assert level == 1
+    assert "no cloud on /points for" in message
+
+
+def test_localizing_anew_is_a_service(active: Robot, world: World) -> None:
+    assert active.call(Empty, "/reinitialize_global_localization", Empty.Request()) is not None
+    assert active.localize(world.points(3)).status.status == NavSatStatus.STATUS_FIX
+
+
+def set_parameter(robot: Robot, name: str, value: ParameterValue) -> tuple[bool, str]:
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
+    result = robot.call(SetParameters, "/localizer/set_parameters", request).results[0]
+    return result.successful, result.reason
+
+
+def double(value: float) -> ParameterValue:
+    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(value))
+
+
+def double_array(*values: float) -> ParameterValue:
+    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=list(values))
+
+
+def text(value: str) -> ParameterValue:
+    return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("scan.min_range_m", double(-1.0), "scan.min_range_m"),
+        ("scan.min_rage_m", double(1.0), "scan.min_rage_m"),
+        ("scan.min_range_m", text("near"), "scan.min_range_m"),
+        ("scan.body_min_m", double_array(1.0), "'scan.body_min_m' must hold 3 values"),
+        ("map", text("/elsewhere"), "clean the node up first"),
+        ("autostart", ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=False), "at the start"),
+    ],
+)  # fmt: skip
+def test_a_parameter_that_cannot_be_is_refused_with_its_name(
+    active: Robot, name: str, value: ParameterValue, reason: str
+) -> None:
+    successful, why = set_parameter(active, name, value)
+    assert not successful
+    assert reason in why
+
+
+def test_a_setting_of_the_localizer_takes_effect_while_it_runs(active: Robot, world: World) -> None:
+    assert set_parameter(active, "scan.max_range_m", double(5.0)) == (True, "")
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_NO_FIX
+    assert "outside 1 to 5 m" in active.diagnosis()[1]
+    assert set_parameter(active, "scan.max_range_m", double(100.0)) == (True, "")
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_FIX
+
+
+def test_parameters_carry_description_and_range(active: Robot) -> None:
+    names = ["scan.mounting.z_m", "top_k", "device"]
+    request = DescribeParameters.Request(names=names)
+    z, top_k, device = active.call(DescribeParameters, "/localizer/describe_parameters", request).descriptors
+    assert z.description == "above the ground under the robot"
+    assert (z.floating_point_range[0].from_value, z.floating_point_range[0].to_value) == (-5.0, 20.0)
+    assert (top_k.integer_range[0].from_value, top_k.integer_range[0].to_value) == (1, 1000)
+    assert device.additional_constraints == "one of: cpu, cuda"
+
+
+def test_the_lifecycle_goes_round(active: Robot, world: World) -> None:
+    assert active.change_state(Transition.TRANSITION_DEACTIVATE)
+    assert active.state() == "inactive"
+    active.wait_until(lambda: active.clouds.get_subscription_count() == 0, what="for the node to stop listening")
+    assert active.diagnosis()[:2] == (0, "inactive")
+    assert active.change_state(Transition.TRANSITION_CLEANUP)
+    assert active.node.count_publishers("/localizer/fix") == 0
+    assert set_parameter(active, "map", text("/elsewhere"))[0], "unconfigured, the map may be chosen"
+    assert not active.change_state(Transition.TRANSITION_CONFIGURE)
+    assert active.state() == "unconfigured"
+    level, message, _ = active.diagnosis()
+    assert level == 2
+    assert "/elsewhere does not exist" in message
+    assert set_parameter(active, "map", text(str(world.map_path)))[0]
+    assert active.change_state(Transition.TRANSITION_CONFIGURE)
+    assert active.change_state(Transition.TRANSITION_ACTIVATE)
+    active.wait_for_localizer()
+    assert active.localize(world.points(6)).status.status == NavSatStatus.STATUS_FIX
+
+
+# A second node, told what to do by a manager, in simulated time, with an IMU and a driver that is reliable.
+
+TILT = np.radians(12.0)
+R_TILT = np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0, np.cos(TILT)]])
+
+
+@pytest.fixture(scope="module")
+def managed(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
+    own = {"autostart": False, "use_sim_time": True, "use_imu": True, "imu_time_constant_s": 0.01}
+    node = start_node(
+        {**world.parameters(), **own, "qos_overrides./rover/lidar.subscription.reliability": "reliable"},
+        "-r", "__ns:=/rover", "-r", "points:=lidar",
+    )  # fmt: skip
+    yield node
+    assert node.is_alive, f"a test has ended the node:\n{node.output}"
+    assert node.stop(signal.SIGTERM) == 0
+    assert "Traceback" not in node.output
+
+
+def test_a_managed_node_in_a_namespace_levels_by_the_imu(
+    managed: NodeProcess, robot: Robot, world: World, robot_context: rclpy.Context
+) -> None:
+    from lifecycle_msgs.srv import ChangeState, GetState
+
+    def state() -> str:
+        return str(robot.call(GetState, "/rover/localizer/get_state", GetState.Request()).current_state.label)
+
+    clock = robot.node.create_publisher(Clock, "/clock", 1)
+    assert state() == "unconfigured"
+    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        request = ChangeState.Request(transition=Transition(id=int(transition)))
+        assert robot.call(ChangeState, "/rover/localizer/change_state", request).success, managed.output
+    assert state() == "active"
+
+    fixes: list[NavSatFix] = []
+    robot.node.create_subscription(NavSatFix, "/rover/localizer/fix", fixes.append, 10)
+    reliable = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+    clouds = robot.node.create_publisher(PointCloud2, "/rover/lidar", reliable)
+    imu = robot.node.create_publisher(Imu, "/rover/imu", 10)
+    robot.wait_until(lambda: clouds.get_subscription_count() and imu.get_subscription_count(), what="for the inputs")
+    robot.wait_until(lambda: robot.node.count_publishers("/rover/localizer/fix"), what="for the fix")
+    offered = robot.node.get_subscriptions_info_by_topic("/rover/lidar")[0].qos_profile.reliability
+    assert offered == ReliabilityPolicy.RELIABLE, "the override must have reached the subscription"
+
+    # The robot stands on a slope of 12 degrees: sensor and IMU are tilted alike, the town is not.
+    sensor = np.array([0.0, 0.0, 1.2])
+    level = world.points(12).astype(np.float64) + sensor
+    tilted = (level @ R_TILT) - sensor
+    up = np.array([0.0, 0.0, 9.81]) @ R_TILT
+
+    def localize(force: np.ndarray | None) -> NavSatFix:
+        message = robot.message(tilted)
+        if force is not None:
+            sample = Imu(header=message.header)
+            sample.linear_acceleration.x, sample.linear_acceleration.y, sample.linear_acceleration.z = map(float, force)
+            imu.publish(sample)
+            robot.spin(0.3)
+        clouds.publish(message)
+        robot.wait_until(lambda: fixes and fixes[-1].header.stamp == message.header.stamp, what="for the fix")
+        return fixes[-1]
+
+    with_imu = localize(up)
+    for _ in range(100):
+        next(robot.stamps_ns)  # ten seconds: the sample is too old then to say anything
+    without = localize(None)
+    assert without.status.status == NavSatStatus.STATUS_NO_FIX
+    assert with_imu.status.status == NavSatStatus.STATUS_FIX
+
+    now = Clock()
+    now.clock.sec = 4321
+    robot.wait_until(
+        lambda: clock.publish(now) or any(d.header.stamp.sec == 4321 for d in robot.diagnostics),
+        what="for diagnostics in simulated time",
+    )
+    names = {d.status[0].name for d in robot.diagnostics if d.header.stamp.sec == 4321}
+    assert names == {"rover/localizer: localization"}
+
+
+# Starts that must fail, all at once because each has to import its libraries first.
+
+
+@pytest.fixture(scope="module")
+def refused(start_node: StartNode, world: World, tmp_path_factory: pytest.TempPathFactory) -> dict[str, NodeProcess]:
+    good = world.parameters()
+    folder = tmp_path_factory.mktemp("maps")
+    truncated = folder / "truncated"
+    shutil.copytree(world.map_path, truncated)
+    index = truncated / "descriptors.faiss"
+    index.write_bytes(index.read_bytes()[:-100])
+    params_file = folder / "parameters.yaml"
+    params_file.write_text("localizer:\n  ros__parameters:\n    scan:\n      mounting:\n        height_m: 1.5\n")
+    broken_file = folder / "broken.yaml"
+    broken_file.write_text("localizer:\n  ros__parameters\n    - no\n  yes: {")
+    return {
+        "unknown parameter": start_node({**good, "scan.min_rang_m": 2.0}),
+        "unknown in a file": start_node(good, "--params-file", str(params_file)),
+        "broken file": start_node(good, "--params-file", str(broken_file)),
+        "out of range": start_node({**good, "top_k": 0}),
+        "wrong type": start_node({**good, "scan.mounting.z_m": "high"}),
+        "QoS of another topic": start_node({**good, "qos_overrides./lidar.subscription.depth": 3}),
+        "no such QoS": start_node({**good, "qos_overrides./points.subscription.reliability": "sometimes"}),
+        "no map": start_node({"weights": good["weights"]}),
+        "missing map": start_node({**good, "map": str(folder / "nowhere")}),
+        "truncated map": start_node({**good, "map": str(truncated)}),
+        "other weights": start_node({**good, "weights": str(world.other_weights_path)}),
+        "missing weights": start_node({**good, "weights": str(folder / "none.safetensors")}),
+        "TF without tf2": start_node({**good, "mounting_from_tf": True}),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("unknown parameter", "unknown parameter 'scan.min_rang_m': did you mean 'scan.min_range_m'?"),
+        ("unknown in a file", "unknown parameter 'scan.mounting.height_m'"),
+        ("broken file", "broken.yaml"),
+        ("out of range", "'top_k' must lie between 1 and 1000"),
+        ("wrong type", "'scan.mounting.z_m' must be of type float"),
+        ("QoS of another topic", "QoS can be overridden for /points, /imu"),
+        ("no such QoS", "qos_overrides./points"),
+        ("no map", "parameter 'map' is empty"),
+        ("missing map", "does not exist; build one with"),
+        ("truncated map", "is truncated"),
+        ("other weights", "was made by other weights"),
+        ("missing weights", "no such weights file"),
+        ("TF without tf2", "needs tf2_ros, which is not installed"),
+    ],
+)
+def test_a_node_that_cannot_run_says_why_and_ends(refused: dict[str, NodeProcess], case: str, words: str) -> None:
+    node = refused[case]
+    assert node.wait() == 2, node.output
+    assert words in node.output
+    assert "Traceback" not in node.output
+
+
+@pytest.mark.parametrize("after_s", [0.3, 1.5, 3.0])
+def test_ctrl_c_at_any_moment_of_the_start_ends_cleanly(start_node: StartNode, world: World, after_s: float) -> None:
+    node = start_node(world.parameters())
+    time.sleep(after_s)
+    code = node.stop(signal.SIGINT)
+    # Before Python runs any of our code a signal is the interpreter's own affair.
+    assert code in ((0, 130, -2) if after_s < 1 else (0,)), node.output
+    assert code != 0 or "Traceback" not in node.output
