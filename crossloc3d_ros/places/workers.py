@@ -28,6 +28,7 @@ Advance = Callable[[int], None]
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+_ANSWER_WITHIN_S = 10
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -173,7 +174,7 @@ class DaskWorkers(RemoteWorkers):
                 futures.append(future)
             return futures
 
-        running = as_completed(submit(in_flight))
+        running = as_completed(submit(in_flight), loop=self._client.loop)
         for future in running:
             yield numbers.pop(future.key), future.result()
             for following in submit(1):
@@ -240,7 +241,7 @@ def _dask_client(scheduler: str, folder: Path) -> Iterator[Any]:
     except ImportError as error:
         raise ConfigError("--scheduler needs Dask: pip install distributed") from error
     try:
-        client = Client(scheduler, timeout=10, set_as_default=False)
+        client = Client(scheduler, timeout=_ANSWER_WITHIN_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"no Dask scheduler answers at {scheduler}: {error}") from error
     try:

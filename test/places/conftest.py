@@ -58,7 +58,7 @@ def terrain_height(easting: np.ndarray, northing: np.ndarray) -> np.ndarray:
     return 3.0 + 0.02 * (easting - WEST) + 0.5 * np.sin((northing - SOUTH) / 40.0)
 
 
-def make_survey(width_m: float = 200.0, height_m: float = 150.0, density: float = 4.0, seed: int = 0) -> Survey:
+def make_survey(width_m: float = 160.0, height_m: float = 120.0, density: float = 3.0, seed: int = 0) -> Survey:
     """Return the survey in EPSG:32631: houses of 10 x 8 m, 6 m high, every 25 m; classes 2 and 6."""
     rng = np.random.default_rng(seed)
     count = int(width_m * height_m * density)
