@@ -76,7 +76,8 @@ def _make_places(arguments: argparse.Namespace) -> int:
         workers=arguments.workers,
         report=lambda made: console.print(
             f"{made.done:4d} of {made.total} towns  {made.town.family:<12} {made.town.scans:4d} scans  "
-            f"{made.town.submaps:4d} submaps  {made.town.seconds:5.1f} s  ends in {_duration(made.remaining_s)}"
+            f"{made.town.submaps:4d} submaps  {made.town.seconds:5.1f} s  ends in {_duration(made.remaining_s)}",
+            soft_wrap=True,
         ),
     )
     print(f"{arguments.output}: {sum(t.scans for t in manifest.towns):,} scans in {len(manifest.towns)} towns")
@@ -92,9 +93,8 @@ def _run(arguments: argparse.Namespace) -> int:
     validation = trainer.run(resume=arguments.resume)
     trainer.write_card()
     for recall in validation.recalls:
-        print(
-            f"{recall.label:>5} within {recall.radius_m:3.0f} m: {100 * recall.value:5.1f} %  (chance {100 * recall.chance:.1f} %)"
-        )
+        share, chance = 100 * recall.value, 100 * recall.chance
+        print(f"{recall.label:>5} within {recall.radius_m:3.0f} m: {share:5.1f} %  (chance {chance:.1f} %)")
     return 0
 
 
@@ -135,14 +135,16 @@ def _progress(console: Console) -> Any:
         )
         if progress.validation is None:
             console.print(
-                f"{line}  {progress.samples_per_second:5.1f} clouds/s  ends in {_duration(progress.remaining_s)}"
+                f"{line}  {progress.samples_per_second:5.1f} clouds/s  ends in {_duration(progress.remaining_s)}",
+                soft_wrap=True,
             )
         else:
             near, far = progress.validation.recall("R@1", 25.0), progress.validation.recall("R@1", 100.0)
             most = progress.validation.recall("R@25", 100.0)
             console.print(
                 f"{line}  validation: R@1 {100 * far.value:.1f} % at 100 m (chance {100 * far.chance:.1f} %), "
-                f"{100 * near.value:.1f} % at 25 m; R@25 {100 * most.value:.1f} % at 100 m"
+                f"{100 * near.value:.1f} % at 25 m; R@25 {100 * most.value:.1f} % at 100 m",
+                soft_wrap=True,
             )
 
     return show

@@ -37,7 +37,7 @@ def model_card(folder: Path, manifest: Manifest, result: dict[str, Any] | None =
         _course(validations),
         _data(manifest),
         _training(settings, steps, starts, last, len(starts) - 1),
-        _limits(),
+        _LIMITS,
     ]
     return "\n".join(sections)
 
@@ -128,39 +128,28 @@ def _training(
         f"{first['processor']}, {first['threads']} of {first['cores']} cores, accelerator: {first['accelerator']}"
     )
     recipe = {key: value for key, value in settings.items() if key not in ("model", "preprocessing", "device")}
-    return (
-        "\n".join(
-            [
-                "## Training\n",
-                f"* Command: `train run --places PLACES --output RUN {first.get('budget', '')}`, seed {settings['seed']}; "
-                f"interrupted and resumed {resumed} times.",
-                f"* {last['step']:,} steps, {samples:,} clouds, {last['elapsed_s'] / 3600:.2f} hours, validation included; "
-                f"training loss at the end {loss}.",
-                f"* Machine: {hardware}. Python {first['python']}, torch {first['torch']}, numpy {first['numpy']}.",
-                f"* Network: `{json.dumps(settings['model'])}`",
-                f"* Recipe: `{json.dumps(recipe)}`",
-                "* AdamW, warm-up and cosine over the budget, clipped gradients, averaged weights with batch-norm statistics "
-                "of their own; both sides of a pair are turned over the full circle, mirrored together, scans thinned and "
-                "partly blocked; the loss is on the Euclidean distance that the map is searched by.",
-            ]
-        )
-        + "\n"
-    )
+    budget = first.get("budget", "")
+    return f"""## Training
+
+* Command: `train run --places PLACES --output RUN {budget} --config SETTINGS`, the settings being those below; \
+seed {settings["seed"]}; interrupted and resumed {resumed} times.
+* {last["step"]:,} steps, {samples:,} clouds, {last["elapsed_s"] / 3600:.2f} hours on the clock, validation included, \
+beside other work on the same machine; training loss at the end {loss}.
+* Machine: {hardware}. Python {first["python"]}, torch {first["torch"]}, numpy {first["numpy"]}.
+* Network: `{json.dumps(settings["model"])}`
+* Recipe: `{json.dumps(recipe)}`
+* AdamW, warm-up and cosine over the budget, clipped gradients, averaged weights with batch-norm statistics of their \
+own; both sides of a pair are turned over the full circle and mirrored together, scans are thinned and partly blocked; \
+the loss is on the Euclidean distance that the map is searched by.
+"""
 
 
-def _limits() -> str:
-    return (
-        "\n".join(
-            [
-                "## What it cannot do\n",
-                "* It has seen simulated towns only: real buildings, trees and sensors differ, and the figures above do not "
-                "carry over to them. Judge it on a drive through a real survey before relying on it.",
-                "* It tells places apart by what stands above the ground within 50 m. Open fields, water, forests without "
-                "structure, tunnels and interiors give it nothing to go by.",
-                "* It knows one sensor (16 beams, -15 to +15 degrees) at 0.9 to 1.6 m above the ground, standing upright "
-                "within a few degrees.",
-                "* A descriptor gives a place, not a heading, and not a metre: the nearest submap's centre is the answer.",
-            ]
-        )
-        + "\n"
-    )
+_LIMITS = """## What it cannot do
+
+* It has seen simulated towns only: real buildings, trees and sensors differ, and the figures above do not carry over \
+to them. Judge it on a drive through a real survey before relying on it.
+* It tells places apart by what stands above the ground within 50 m. Open fields, water, forests without structure, \
+tunnels and interiors give it nothing to go by.
+* It knows one sensor (16 beams, -15 to +15 degrees) near 0.9 to 1.6 m above the ground, upright within a few degrees.
+* A descriptor gives a place, not a heading, and not a metre: the nearest submap's centre is the answer.
+"""

@@ -66,7 +66,7 @@ class Made:
 
 
 def plan_towns(seed: int, towns: int, validation_towns: int, families: Sequence[str]) -> list[TownTask]:
-    """Return the towns of a set, validation first, families in turns; more towns extend a set, they do not change it."""
+    """Return the towns of a set, validation first, families in turns; more towns extend a set without changing it."""
     if towns < 0 or validation_towns < 0 or max(towns, validation_towns) > _VALIDATION_SEEDS:
         raise ConfigError(
             f"a set holds 0 to {_VALIDATION_SEEDS:,} towns of each role, asked for {towns} and {validation_towns}"
@@ -164,7 +164,7 @@ def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generat
     The terrain is made from the points of class ground, not taken from the simulator: the same errors as in a map.
     """
     survey = fly(town, SurveyConfig(spacing_m=config.survey_spacing_m), rng)
-    terrain = terrain_raster(survey.points, survey.classification == GROUND_CLASS, tuple(town.bounds), config.cell_m)
+    terrain = terrain_raster(survey.points, survey.classification == GROUND_CLASS, town.bounds, config.cell_m)
     heights = survey.points[:, 2] - terrain.sample(survey.points[:, 0], survey.points[:, 1])
     return np.column_stack([survey.points[:, :2], heights])
 
@@ -172,7 +172,7 @@ def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generat
 def scan_town(
     town: Town, T_world_base: Float64Array, config: PlacesConfig, rng: np.random.Generator
 ) -> tuple[Scan, ScanConfig, Float64Array | None]:
-    """Scan a town from one pose (4, 4) of the robot; return the scan, its settings and the IMU's "up", at times none."""
+    """Scan a town from a pose (4, 4) of the robot; return the scan, its settings and the IMU's "up", at times none."""
     mounting = MountingConfig(z_m=float(rng.uniform(*config.sensor_height_m)))
     T_base_lidar = mounting_matrix(mounting)
     twist = np.array([rng.uniform(0.0, 2.0), 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5)])

@@ -36,7 +36,11 @@ _FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "l
 
 def prepare(folder: Path, config: TrainConfig, manifest: Manifest, places: Path, *, resume: bool) -> None:
     """Make the folder of a new run, or check that the one to resume has the same settings and places."""
-    settings = {"config": to_dict(config), "places": str(places), "places_sha256": places_hash(manifest)}
+    settings: dict[str, Any] = {
+        "config": to_dict(config),
+        "places": str(places),
+        "places_sha256": places_hash(manifest),
+    }
     path = folder / SETTINGS
     if not resume:
         if path.exists():

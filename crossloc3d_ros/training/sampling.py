@@ -46,8 +46,8 @@ class PointField:
         self._columns, self._rows = int(columns), int(rows)
 
     def cut(self, centre: Float64Array, heading_rad: float, half_extent_m: float) -> Float32Array:
-        """Return the points (n, 3) of the square around `centre` (2,) as seen along a heading, x and y from the centre."""
-        return _cut(
+        """Return the points (n, 3) of the square around `centre` (2,), seen along a heading from its centre."""
+        cut: Float32Array = _cut(
             self._points,
             self._starts,
             self._columns,
@@ -59,6 +59,7 @@ class PointField:
             heading_rad,
             half_extent_m,
         )
+        return cut
 
 
 class BatchSampler:
@@ -142,7 +143,7 @@ def _turn(points: Float32Array, angle_rad: float) -> Float32Array:
     return turned
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _cut(
     points: Float32Array,
     starts: Int64Array,

@@ -26,7 +26,7 @@ Int16Array = npt.NDArray[np.int16]
 
 @dataclass(frozen=True, eq=False)
 class TrainingTown:
-    """A town as material: every scan whole and the whole survey, so that patches can be cut at any place and heading."""
+    """A town as material: every scan and the survey whole, so that patches can be cut at any place and heading."""
 
     name: str
     scan_xy_m: Float64Array
@@ -91,7 +91,7 @@ class Manifest:
 
 def write_town(path: Path, town: TrainingTown | ValidationTown) -> None:
     """Write one town, whole or not at all."""
-    arrays = {key: value for key, value in vars(town).items() if isinstance(value, np.ndarray)}
+    arrays: dict[str, Any] = {key: value for key, value in vars(town).items() if isinstance(value, np.ndarray)}
     partial = path.with_name(f".{path.name}.partial")
     try:
         with partial.open("wb") as file:

@@ -29,11 +29,11 @@ TINY = ModelConfig(
     descriptor_size=32,
 )  # fmt: skip
 TINY_TRAINING = TrainConfig(
-    pairs=8,
+    pairs=6,
     towns_a_batch=4,
     learning_rate=3e-3,
     model=TINY,
-    preprocessing=PreprocessingConfig(n_points=512, min_points=32),
+    preprocessing=PreprocessingConfig(n_points=256, min_points=32),
     log_steps=2,
 )
 
@@ -75,7 +75,7 @@ def validation_town(seed: int, config: PreprocessingConfig, queries: int = 12) -
     rng = np.random.default_rng(seed)
     points = boxes(rng)
     cutter = SubmapCutter(points.astype(np.float64), config)
-    centres = submap_centres((50.0, 50.0, SIZE_M - 50.0, SIZE_M - 50.0), 19.0)
+    centres = submap_centres((50.0, 50.0, SIZE_M - 50.0, SIZE_M - 50.0), 38.0)
     cut = [(c, patch.points) for c in centres if (patch := cutter.cut(c)) is not None]
     asked = []
     for place in rng.uniform(55, SIZE_M - 55, (queries, 2)):
