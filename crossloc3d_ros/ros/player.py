@@ -98,16 +98,17 @@ class Player:
         clock_qos = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._clock = node.create_publisher(Clock, "/clock", clock_qos) if config.clock else None
 
-    def wait_for_subscribers(self) -> None:
+    def wait_for_subscribers(self, check: Callable[[], None] = lambda: None) -> None:
         """Return once every topic with clouds (any topic, if there are none) is subscribed to.
 
-        Raises CrossLocError after `wait_s`. Meanwhile `/clock` stands at the start of the recording, because a node
-        with simulated time may need it to come up.
+        Raises CrossLocError after `wait_s`; `check` is called now and then and may raise earlier. Meanwhile `/clock`
+        stands at the start of the recording, because a node with simulated time may need it to come up.
         """
         if self._config.wait_s == 0.0:
             return
         deadline = time.monotonic() + self._config.wait_s
         while not self._subscribed():
+            check()
             if time.monotonic() > deadline:
                 waiting = ", ".join(p.topic_name for p in self._clouds) or "any of the topics"
                 raise CrossLocError(
