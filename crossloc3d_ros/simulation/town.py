@@ -48,9 +48,9 @@ class Town(World):
     layout: Layout
 
     def digest(self) -> str:
-        """Return a hash of all triangles, to the millimetre: equal towns have equal digests on every machine."""
+        """Return a hash of all triangles, to the centimetre: it tells whether two towns are the same."""
         summary = hashlib.sha256()
-        # Libraries for sine and cosine differ in the last bit between machines; a millimetre does not.
+        # Sine and cosine differ in the last bit between machines; a centimetre hardly ever does.
         summary.update(np.rint(self.scene.vertices.astype(np.float64) * 100).astype("<i4").tobytes())
         summary.update(self.scene.faces.astype("<i4").tobytes())
         summary.update(self.scene.labels.tobytes())
