@@ -116,6 +116,7 @@ class LocalizerNodeConfig(LocalizerConfig):
     map: str = option("", "folder of the aerial map, as build_map writes it")
     weights: str = option("", "weights file (safetensors); empty = the shipped weights")
     device: Literal["cpu", "cuda"] = option("cpu", "where the encoder runs")
+    threads: int = option(0, "CPU threads for a descriptor; 0 = as many as cores, at most four", low=0, high=64)
     autostart: bool = option(True, "configure and activate without being told by a lifecycle manager")
     global_frame_id: str = option("map", "name of the ENU frame at the map's origin")
     base_frame_id: str = option("base_link", "name of the frame whose position is given")

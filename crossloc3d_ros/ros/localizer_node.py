@@ -72,7 +72,8 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     # Late, because torch takes seconds: wrong parameters are refused and the node is on the graph before.
     from crossloc3d_ros.encoder.checkpoint import load_encoder
 
-    encoder = load_encoder(Path(config.weights) if config.weights else None, device=config.device)
+    weights = Path(config.weights) if config.weights else None
+    encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
     return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
 
 
@@ -211,6 +212,7 @@ class LocalizerNode(LifecycleNode):
         localizer = self._localizer
         if localizer is None:
             raise ConfigError("the node is not configured")
+        self.get_logger().info("warming up; the first start on a machine compiles for a while")
         # In the worker's own thread, because numerical libraries keep state for each thread.
         self._worker.start(localizer.warm_up)
         self._statistics.reset()
