@@ -118,6 +118,7 @@ class ProgressDisplay:
         """Show that `done` of `total` units of a stage are done."""
         now = time.monotonic()
         # What an earlier run did counts as done but not towards the rate.
+        is_new = stage not in self._started
         begun_s, begun = self._started.setdefault(stage, (now, done))
         rate = (done - begun) / (now - begun_s) if now > begun_s else 0.0
         text = f"{done:,.0f} of {total:,.0f} {unit}" + (f", {rate:,.3g} a second" if rate > 0 else "")
@@ -125,7 +126,7 @@ class ProgressDisplay:
             if stage not in self._tasks:
                 self._tasks[stage] = self._bar.add_task(stage, total=total, rate="")
             self._bar.update(self._tasks[stage], completed=done, rate=text)
-        elif done >= total or now - self._last_line_s >= self._line_every_s:
+        elif is_new or done >= total or now - self._last_line_s >= self._line_every_s:
             left = f", {(total - done) / rate:,.0f} s left" if rate > 0 and done < total else ""
             self._console.print(f"{stage}: {text}{left}")
             self._last_line_s = now
