@@ -341,11 +341,41 @@ def _fill_table(coords: Any, low: Any, shape: Any, table: Any, begin: int, end: 
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
+def widen(coords: Any, begin: int, end: int, low: Any, high: Any) -> None:
+    """Widen the box from low to high (3,) so that it holds coords[begin:end]."""
+    for n in range(begin, end):
+        for axis in range(3):
+            low[axis] = min(low[axis], coords[n, axis])
+            high[axis] = max(high[axis], coords[n, axis])
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def lower_bound(keys: Any, wanted: int) -> int:
+    """Return the first position in sorted keys that is not below `wanted` (NumPy's own compiles for seconds)."""
+    low, high = 0, len(keys)
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
+def find_key(keys: Any, wanted: int) -> int:
+    """Return the position of `wanted` in sorted keys, or -1."""
+    at = lower_bound(keys, wanted)
+    return at if at < len(keys) and keys[at] == wanted else -1
+
+
+@njit(cache=True, nogil=True, boundscheck=False)
 def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel_size: int, step: int) -> Any:
     """Find for every output site its input neighbours.
 
     coords (N, 3) and queries (M, 3) int32 hold x, y, z of the input and output sites, cloud by cloud as `starts` and
-    `query_starts` (B + 1,) say. Kernel index k = ix + K iy + K^2 iz, offset (ix - K // 2, ...) times `step`.
+    `query_starts` (B + 1,) say, each cloud's sorted by z, then y, then x. Kernel index k = ix + K iy + K^2 iz, offset
+    (ix - K // 2, ...) times `step`.
     Returns in_rows (P,), out_rows (P,) int32, sorted by kernel and then by output row, and first (K^3 + 1,) int64,
     where each kernel's pairs begin.
     """
@@ -364,10 +394,13 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
         query_begin, query_end = query_starts[cloud], query_starts[cloud + 1]
         if begin == end or query_begin == query_end:
             continue
+        low[:] = coords[begin]
+        high[:] = coords[begin]
+        widen(coords, begin, end, low, high)
+        widen(queries, query_begin, query_end, low, high)
         for axis in range(3):
-            low[axis] = min(coords[begin:end, axis].min(), queries[query_begin:query_end, axis].min()) - radius
-            high[axis] = max(coords[begin:end, axis].max(), queries[query_begin:query_end, axis].max()) + radius
-            shape[axis] = high[axis] - low[axis] + 1
+            low[axis] -= radius
+            shape[axis] = high[axis] + radius - low[axis] + 1
         cells = shape[0] * shape[1] * shape[2]
         dense = float(shape[0]) * float(shape[1]) * float(shape[2]) <= MAX_DENSE_CELLS
         if dense and cells > len(table):
@@ -380,8 +413,6 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
                 keys[n - begin] = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (
                     coords[n, 0] - low[0]
                 )
-            order = np.argsort(keys)
-            keys = keys[order]
         base = np.empty(query_end - query_begin, np.int64)
         for m in range(query_begin, query_end):
             base[m - query_begin] = ((queries[m, 2] - low[2]) * shape[1] + (queries[m, 1] - low[1])) * shape[0] + (
@@ -400,9 +431,9 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
                             count += n >= 0
                     else:
                         for m in range(query_end - query_begin):
-                            at = np.searchsorted(keys, base[m] + delta)
-                            if at < len(keys) and keys[at] == base[m] + delta:
-                                found[k, query_begin + m] = begin + order[at]
+                            at = find_key(keys, base[m] + delta)
+                            if at >= 0:
+                                found[k, query_begin + m] = begin + at
                                 count += 1
                     first[k + 1] += count
                     k += 1

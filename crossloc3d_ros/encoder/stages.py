@@ -9,7 +9,17 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from crossloc3d_ros.encoder.kernels import COLUMNS, MAX_DENSE_CELLS, dense_product, gather_product, strided_product
+from crossloc3d_ros.encoder.kernels import (
+    COLUMNS,
+    MAX_DENSE_CELLS,
+    dense_product,
+    find_key,
+    gather_product,
+    lower_bound,
+    strided_product,
+    widen,
+)
+from crossloc3d_ros.types import Float32Array, Int32Array
 
 _exact = njit(cache=True, nogil=True, boundscheck=False)
 _fused = njit(cache=True, nogil=True, boundscheck=False, fastmath={"contract"})
@@ -46,61 +56,50 @@ def _exp(x: Any) -> Any:
     return (p * r * r + r + _ONE) * _as_float(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
 
 
-@_exact
-def unique_sites(coords: Any) -> Any:
-    """Return the distinct rows of coords (n, 3) int32, sorted by z, then y, then x."""
-    low = np.empty(3, np.int64)
-    shape = np.empty(3, np.int64)
-    for axis in range(3):
-        low[axis] = coords[:, axis].min()
-        shape[axis] = coords[:, axis].max() - low[axis] + 1
+def unique_sites(coords: Int32Array) -> Int32Array:
+    """Return the distinct rows of coords (n, 3), sorted by z, then y, then x."""
+    low = coords.min(axis=0).astype(np.int64)
+    shape = coords.max(axis=0) - low + 1
     if float(shape[0]) * float(shape[1]) * float(shape[2]) <= MAX_DENSE_CELLS:
-        seen = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
-        count = 0
-        for i in range(len(coords)):
-            cell = ((coords[i, 2] - low[2]) * shape[1] + (coords[i, 1] - low[1])) * shape[0] + (coords[i, 0] - low[0])
-            count += not seen[cell]
-            seen[cell] = True
-        keys = np.empty(count, np.int64)
-        count = 0
-        for cell in range(len(seen)):
-            if seen[cell]:
-                keys[count] = cell
-                count += 1
-    else:
-        every = np.empty(len(coords), np.int64)
-        for i in range(len(coords)):
-            every[i] = ((coords[i, 2] - low[2]) * shape[1] + (coords[i, 1] - low[1])) * shape[0] + (
-                coords[i, 0] - low[0]
-            )
-        keys = np.unique(every)
-    sites = np.empty((len(keys), 3), np.int32)
-    for i in range(len(keys)):
-        rest = keys[i] // shape[0]
-        sites[i, 0] = keys[i] - rest * shape[0] + low[0]
-        sites[i, 1] = rest % shape[1] + low[1]
-        sites[i, 2] = rest // shape[1] + low[2]
+        sites: Int32Array = _dense_sites(coords, low, shape)
+        return sites
+    x, y, z = (coords - low).T
+    key = np.unique((z * shape[1] + y) * shape[0] + x)
+    rest = key // shape[0]
+    columns = key % shape[0] + low[0], rest % shape[1] + low[1], rest // shape[1] + low[2]
+    return np.stack(columns, axis=1).astype(np.int32)
+
+
+@_exact
+def _dense_sites(coords: Any, low: Any, shape: Any) -> Any:
+    seen = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
+    count = 0
+    for i in range(len(coords)):
+        cell = ((coords[i, 2] - low[2]) * shape[1] + (coords[i, 1] - low[1])) * shape[0] + (coords[i, 0] - low[0])
+        count += not seen[cell]
+        seen[cell] = True
+    sites = np.empty((count, 3), np.int32)
+    count = cell = 0
+    for z in range(shape[2]):
+        for y in range(shape[1]):
+            for x in range(shape[0]):
+                if seen[cell]:
+                    sites[count, 0] = x + low[0]
+                    sites[count, 1] = y + low[1]
+                    sites[count, 2] = z + low[2]
+                    count += 1
+                cell += 1
     return sites
 
 
-@_exact
-def voxels(points: Any, size: Any) -> Any:
+def voxels(points: Float32Array, size: np.float32) -> Int32Array:
     """Return the sites `floor(x / size)` of points (n, 3) float32, divided in float32; see `sparse.voxelize`."""
-    coords = np.empty(points.shape, np.int32)
-    for i in range(len(points)):
-        for axis in range(3):
-            coords[i, axis] = np.int32(np.floor(points[i, axis] / size))
-    return unique_sites(coords)
+    return unique_sites(np.floor(points / size).astype(np.int32))
 
 
-@_exact
-def coarser(sites: Any) -> Any:
+def coarser(sites: Int32Array) -> Int32Array:
     """Return the sites of stride 2: the distinct `floor(c / 2) * 2`."""
-    coords = np.empty(sites.shape, np.int32)
-    for i in range(len(sites)):
-        for axis in range(3):
-            coords[i, axis] = sites[i, axis] & ~1
-    return unique_sites(coords)
+    return unique_sites(sites & ~1)
 
 
 @_exact
@@ -116,7 +115,7 @@ def split_pairs(out_rows: Any, first: Any, n_rows: int, parts: int) -> Any:
         load[row + 1] += load[row]
     rows = np.zeros(parts + 1, np.int64)
     for part in range(1, parts):
-        rows[part] = np.searchsorted(load, len(out_rows) * part // parts)
+        rows[part] = lower_bound(load, len(out_rows) * part // parts)
     rows[parts] = n_rows
     kernels = len(first) - 1
     begin = np.empty((parts, kernels), np.int64)
@@ -125,7 +124,7 @@ def split_pairs(out_rows: Any, first: Any, n_rows: int, parts: int) -> Any:
         at = first[k]
         for part in range(parts):
             begin[part, k] = at
-            at = first[k] + np.searchsorted(out_rows[first[k] : first[k + 1]], rows[part + 1])
+            at = first[k] + lower_bound(out_rows[first[k] : first[k + 1]], rows[part + 1])
             end[part, k] = at
     return rows, begin, end
 
@@ -138,11 +137,11 @@ def occupancy(sites: Any, kernel_size: int) -> Any:
     large for a table, the table is empty.
     """
     radius = kernel_size // 2
-    low = np.empty(3, np.int64)
-    shape = np.empty(3, np.int64)
-    for axis in range(3):
-        low[axis] = sites[:, axis].min() - radius
-        shape[axis] = sites[:, axis].max() + radius - low[axis] + 1
+    low = sites[0].astype(np.int64)
+    high = low.copy()
+    widen(sites, 0, len(sites), low, high)
+    low -= radius
+    shape = high + radius - low + 1
     steps = np.empty(kernel_size**3, np.int64)
     k = 0
     for iz in range(-radius, radius + 1):
@@ -168,11 +167,7 @@ def stem(table: Any, places: Any, steps: Any, weights: Any, out: Any, begin: int
     for i in range(begin, end):
         for k in range(len(steps)):
             wanted = places[i] + steps[k]
-            if len(table):
-                there = table[wanted]
-            else:  # places are sorted keys
-                at = np.searchsorted(places, wanted)
-                there = at < len(places) and places[at] == wanted
+            there = table[wanted] if len(table) else find_key(places, wanted) >= 0  # places are sorted keys
             if there:
                 for c in range(channels):
                     out[i, c] += weights[k, c]
