@@ -90,7 +90,7 @@ def test_errors_are_one_line_and_code_2(
     assert error.startswith("error: ") and error.count("\n") == 1 and message in error
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_stopped_command_goes_on(survey: Path, weights: Path, tmp_path: Path, how: signal.Signals) -> None:
     command = [
         sys.executable, "-m", "crossloc3d_ros.cli.build_map", str(survey), "--output", str(tmp_path / "map"),
