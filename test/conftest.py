@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -23,3 +25,63 @@ def shared_path(relative: str) -> Path:
 def shared() -> object:
     """Give the function that finds shared reference data."""
     return shared_path
+
+
+@dataclass(frozen=True)
+class TownDrive:
+    """A made-up block of houses: a survey of it and a recorded drive through it, whatever the encoder."""
+
+    survey: Path
+    bag: Path
+    crs: str
+    truth: np.ndarray
+    """(S, 3) easting, northing, ground height of each scan, metres."""
+    stamps_ns: np.ndarray
+    """(S,)"""
+
+
+@pytest.fixture(scope="session")
+def town_drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
+    """Write survey and drive: scans every 8 m, in any heading, with GNSS at 2 Hz and two doubtful fixes."""
+    from crossloc3d_ros.formats import bag
+    from crossloc3d_ros.formats.las import write_laz
+    from crossloc3d_ros.geodesy import MapFrame
+
+    west, south, side, crs = 628_000.0, 5_803_000.0, 260.0, "EPSG:32631"
+    rng = np.random.default_rng(7)
+    e, n = rng.uniform(0, side, (2, 250_000))
+    z = np.zeros_like(e)
+    for _ in range(60):  # houses of all sizes, none on the street along the middle
+        x, y, w, d = rng.uniform(0, side), rng.uniform(0, side), rng.uniform(6, 24), rng.uniform(6, 18)
+        if abs(y - side / 2) < d / 2 + 7:
+            continue
+        inside = (abs(e - x) < w / 2) & (abs(n - y) < d / 2)
+        z[inside] = rng.uniform(4, 20)
+    house = z > 0
+    z = z + 2.0 + np.where(house, 0.0, rng.normal(0, 0.02, len(z)))
+    points = np.column_stack([e + west, n + south, z])
+    folder = tmp_path_factory.mktemp("town_drive")
+    write_laz(folder / "town.laz", points, np.where(house, 6, 2).astype(np.uint8), crs, scale=0.001)
+
+    frame = MapFrame(crs, np.array([west, south, 2.0]), None)
+    start_ns, step_ns = 1_700_000_000_000_000_000, 500_000_000
+    along = np.arange(50.0, side - 50.0, 8.0)
+    truth = np.column_stack([west + along, np.full(len(along), south + side / 2), np.full(len(along), 2.0)])
+    stamps_ns = start_ns + step_ns * np.arange(len(along)) + 100_000_000
+    latitude, longitude, _ = frame.to_geographic(truth - [0.2 * 16, 0, 0])  # 16 m/s, at the fix 0.1 s before the scan
+    with bag.BagWriter(folder / "drive", "sqlite3") as writer:
+        for i, place in enumerate(truth):
+            fix_ns = int(stamps_ns[i]) - 200_000_000
+            doubtful = i in (5, 6)
+            fix = bag.nav_sat_fix(
+                fix_ns, "gnss", latitude[i] + 0.01 * doubtful, longitude[i], float("nan"),
+                np.eye(3) * (40.0 if doubtful else 1.0) ** 2,
+            )  # fmt: skip
+            writer.write("/gnss", bag.NAV_SAT_FIX, fix_ns, fix)
+            near = points[np.abs(points[:, :2] - place[:2]).max(axis=1) < 30.0] - place
+            yaw = rng.uniform(0, 2 * np.pi)
+            turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+            xyz = np.column_stack([near[:, :2] @ turn.T, near[:, 2] - 1.2])
+            cloud = bag.velodyne_cloud(int(stamps_ns[i]), "velodyne", xyz, 1.0, 0, 0.0)
+            writer.write("/velodyne_points", bag.POINT_CLOUD, int(stamps_ns[i]), cloud)
+    return TownDrive(folder / "town.laz", folder / "drive", crs, truth, stamps_ns)

@@ -91,7 +91,7 @@ def _hillshade(heights: Float64Array, cell_m: float) -> Float64Array:
     # Roofs are far steeper than hills: their slope is compressed, or walls would be all that is seen.
     slope = np.hypot(to_east, to_south)
     scale = np.divide(np.tanh(slope * 0.55), slope, out=np.full_like(slope, 0.55), where=slope > 1e-9)
-    lit = (-to_south * scale + to_east * scale) / math.sqrt(2.0)
+    lit = (to_south + to_east) * scale / math.sqrt(2.0)  # a slope that rises to the south-east faces the sun
     result: Float64Array = np.clip(1.0 + 0.45 * lit, 0.45, 1.5)
     return result
 

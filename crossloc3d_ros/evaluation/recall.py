@@ -114,11 +114,15 @@ def submaps_within(submaps: Float64Array, truth: Float64Array, radius_m: float) 
 
 def independent_places(truth: Float64Array, apart_m: float = INDEPENDENT_M) -> int:
     """Count places at least `apart_m` from each other along the drive (S, 2 or more): a stop adds none."""
-    chosen: list[Float64Array] = []
-    for place in np.asarray(truth)[:, :2]:
-        if all(np.hypot(*(place - other)) >= apart_m for other in chosen):
-            chosen.append(place)
-    return len(chosen)
+    places = np.asarray(truth, dtype=np.float64)[:, :2]
+    chosen = np.empty_like(places)
+    count = 0
+    for place in places:
+        offsets = chosen[:count] - place
+        if not np.any(np.hypot(offsets[:, 0], offsets[:, 1]) < apart_m):
+            chosen[count] = place
+            count += 1
+    return count
 
 
 def wilson_share(value: float, count: int, confidence: float = 0.95) -> Share:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
@@ -76,9 +77,8 @@ def write_report(path: Path, evaluation: Evaluation, aerial_map: AerialMap, abou
         "style": _page_file("page.css"),
         "script": _page_file("page.js"),
     }
-    page = _page_file("page.html")
-    for name in ("style", "script", *(name for name in parts if name not in ("style", "script", "data")), "data"):
-        page = page.replace("{{" + name + "}}", parts[name], 1 if name != "title" else -1)
+    # In one pass, so that nothing is looked for in what was filled in.
+    page = re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], _page_file("page.html"))
     write_atomically(path, page)
 
 
