@@ -72,7 +72,7 @@ class CompiledModel:
     def can_compile(model: CrossLoc3D) -> bool:
         """Say whether every width of the model is a multiple of the vector width."""
         config = model.config
-        widths = [config.channels, config.fused_channels, config.clusters, config.channels // config.heads]
+        widths = [config.channels, config.fused_channels, config.clusters]
         if model.refinement is not None:
             widths += list(config.memory_sizes)
         return all(width % COLUMNS == 0 for width in widths)

@@ -347,8 +347,8 @@ def read_memory(
     """Compute `out = x + relu((attention @ values - x) @ transform + shift)`."""
     heads, panels, memory, _ = values.shape
     channels = x.shape[1]
-    head_width = panels * COLUMNS
-    read = np.empty((BLOCK, channels), np.float32)
+    # The panels of a narrow head are padded with zeros, which the last head adds beyond its row.
+    read = np.empty((BLOCK, channels + COLUMNS), np.float32)
     moved = np.empty((BLOCK, channels), np.float32)
     for start in range(begin, end, BLOCK):
         rows = min(BLOCK, end - start)
@@ -367,10 +367,10 @@ def read_memory(
                 memory * COLUMNS,
                 COLUMNS,
                 read.ravel(),
-                h * head_width,
-                channels,
+                h * (channels // heads),
+                read.shape[1],
                 memory,
-                head_width,
+                panels * COLUMNS,
                 0,
                 rows,
             )

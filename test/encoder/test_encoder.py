@@ -91,6 +91,7 @@ VARIANTS = {
     "fine to coarse": ModelConfig(**{**SMALL.__dict__, "refinement": "fine_to_coarse"}),
     "no refinement": ModelConfig(**{**SMALL.__dict__, "refinement": "none"}),
     "one sub-step, no time": ModelConfig(**{**SMALL.__dict__, "sub_steps": 1, "time_embedding": False}),
+    "narrow heads": ModelConfig(**{**SMALL.__dict__, "heads": 8}),
     "tiny voxels": ModelConfig(**{**SMALL.__dict__, "voxel_sizes": (0.002, 0.12, 0.4)}),
 }
 
