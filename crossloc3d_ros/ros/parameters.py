@@ -74,6 +74,26 @@ class ConfigParameters(Generic[T]):
         """Return the configuration that the parameters' values make; raises ConfigError."""
         return from_dict(self._kind, _nested({name: self._value(name) for name in self._settings}))
 
+    def admit(self, parameters: Sequence[Parameter]) -> list[Parameter]:
+        """Return the parameters as they can be set, integers turned into the floats that they are meant to be.
+
+        Raises ConfigError that names what is unknown or wrong; rclpy's own answer leaves the name out.
+        """
+        admitted = []
+        for parameter in parameters:
+            setting = self._settings.get(parameter.name)
+            if setting is None:
+                if not self._node.has_parameter(parameter.name):
+                    raise ConfigError(self._unknown(parameter.name))
+                admitted.append(parameter)
+                continue
+            reason = self._why_fixed(parameter.name)
+            if reason is not None:
+                raise ConfigError(f"'{parameter.name}' {reason}")
+            value = check_value(parameter.name, setting.hint, _plain(parameter.value), setting.metadata)
+            admitted.append(Parameter(parameter.name, value=_ros(value)))
+        return admitted
+
     def _overrides(self) -> dict[str, Any]:
         given = {name: self._value(name) for name in self._node.list_parameters([], 0).names}
         unknown = [name for name in given if name not in self._settings and not self._is_ros_own(name)]
@@ -101,31 +121,31 @@ class ConfigParameters(Generic[T]):
                 # Once more for its own sake: an integer is turned into the float that the field holds.
                 value = check_value(name, setting.hint, overrides[name], setting.metadata)
                 self._node.undeclare_parameter(name)
-            value = list(value) if isinstance(value, tuple) else value
-            self._node.declare_parameter(name, value, descriptor_of(setting), ignore_override=True)
+            self._node.declare_parameter(name, _ros(value), descriptor_of(setting), ignore_override=True)
 
     def _value(self, name: str) -> Any:
-        value = self._node.get_parameter(name).value
-        return list(value) if isinstance(value, (array.array, tuple)) else value
+        return _plain(self._node.get_parameter(name).value)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            setting = self._settings.get(parameter.name)
-            if setting is None:
-                continue
-            reason = self._why_fixed(parameter.name)
-            if reason is not None:
-                return SetParametersResult(successful=False, reason=f"'{parameter.name}' {reason}")
-            value = list(parameter.value) if isinstance(parameter.value, array.array) else parameter.value
-            try:
-                check_value(parameter.name, setting.hint, value, setting.metadata)
-            except ConfigError as error:
-                return SetParametersResult(successful=False, reason=str(error))
+        try:
+            self.admit(parameters)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _changed(self, parameters: list[Parameter]) -> None:
         if any(parameter.name in self._settings for parameter in parameters):
             self._on_change()
+
+
+def _plain(value: Any) -> Any:
+    """Return a parameter's value as the configuration reads it."""
+    return list(value) if isinstance(value, (array.array, tuple)) else value
+
+
+def _ros(value: Any) -> Any:
+    """Return a configuration's value as a parameter holds it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:

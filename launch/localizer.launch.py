@@ -1,0 +1,60 @@
+"""Start the localizer: `ros2 launch crossloc3d_ros localizer.launch.py map:=FOLDER points:=/velodyne_points`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import LifecycleNode
+
+from launch import LaunchContext, LaunchDescription
+
+SETTINGS = {
+    "map": (str, "folder of the aerial map"),
+    "weights": (str, "weights file; the shipped weights where none is named"),
+    "autostart": (bool, "whether the node configures and activates itself"),
+    "use_sim_time": (bool, "whether the time comes from /clock"),
+}
+"""Parameters that can be given as arguments; what is left empty stays as the parameter file has it."""
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the arguments and the node that is started with them."""
+    defaults = Path(get_package_share_directory("crossloc3d_ros")) / "config" / "localizer.yaml"
+    arguments = {
+        **{name: ("", text) for name, (_, text) in SETTINGS.items()},
+        "points": ("/velodyne_points", "topic of the clouds"),
+        "imu": ("/imu", "topic of the accelerations, where the parameter use_imu is set"),
+        "params_file": (str(defaults), "file of all parameters"),
+        "namespace": ("", "namespace of the node"),
+        "log_level": ("info", "debug, info, warn or error"),
+    }
+    declared = [DeclareLaunchArgument(name, default_value=d, description=t) for name, (d, t) in arguments.items()]
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])
+
+
+def start(context: LaunchContext) -> list[LifecycleNode]:
+    """Return the node, now that the arguments have values."""
+
+    def given(name: str) -> str:
+        return LaunchConfiguration(name).perform(context)
+
+    settings = {
+        name: given(name) if kind is str else given(name).lower() in ("true", "1", "yes")
+        for name, (kind, _) in SETTINGS.items()
+        if given(name)
+    }
+    return [
+        LifecycleNode(
+            package="crossloc3d_ros",
+            executable="localizer",
+            name="localizer",
+            namespace=given("namespace"),
+            output="screen",
+            parameters=[given("params_file"), settings],
+            remappings=[("points", given("points")), ("imu", given("imu"))],
+            ros_arguments=["--log-level", given("log_level")],
+        )
+    ]
