@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
-from crossloc3d_ros.config import ModelConfig, PreprocessingConfig
+from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PreprocessingConfig, from_dict
 from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D
-from crossloc3d_ros.errors import CloudError
+from crossloc3d_ros.errors import CheckpointError, CloudError, ConfigError
 from crossloc3d_ros.types import Float32Array
 
 MAX_THREADS = 4
@@ -40,6 +41,7 @@ class Encoder:
         self._preprocessing = preprocessing
         self._fingerprint = fingerprint
         self.metadata = dict(metadata or {})
+        self._calibration = _calibration(self.metadata)
 
     @property
     def fingerprint(self) -> str:
@@ -55,6 +57,11 @@ class Encoder:
     def model_config(self) -> ModelConfig:
         """Return the configuration of the network."""
         return self._model.config
+
+    @property
+    def calibration(self) -> CalibrationConfig | None:
+        """Return what distances between the descriptors mean, as fitted after training; None where nobody did."""
+        return self._calibration
 
     @property
     def descriptor_size(self) -> int:
@@ -83,3 +90,12 @@ class Encoder:
         """Compile and touch whatever makes the first call slow."""
         spread = np.random.default_rng(0).uniform(-1.0, 1.0, (self._preprocessing.n_points, 3))
         self.encode(spread.astype(np.float32))
+
+
+def _calibration(metadata: Mapping[str, str]) -> CalibrationConfig | None:
+    if "credibility" not in metadata:
+        return None
+    try:
+        return from_dict(CalibrationConfig, json.loads(metadata["credibility"]))
+    except (json.JSONDecodeError, AttributeError, ConfigError) as error:
+        raise CheckpointError(f"the calibration in the weights cannot be used ({error}); export them again") from error

@@ -63,7 +63,7 @@ def _distances(entry: dict[str, Any]) -> str:
     lines = [
         "## Descriptor distances on the same towns\n",
         "Euclidean, to the submap whose centre is nearest to the scan, and to the nearest descriptor among the submaps "
-        "more than 100 m away. The same numbers travel in the weights' metadata (`calibration`).\n",
+        "more than 100 m away. The same numbers travel in the weights' metadata (`distances`).\n",
         "| quantile | " + " | ".join(f"{100 * q:.0f} %" for q in QUANTILES) + " |",
         "|---|" + "---|" * len(QUANTILES),
         "| right | " + " | ".join(f"{d:.2f}" for d in entry["true_distances"]) + " |",

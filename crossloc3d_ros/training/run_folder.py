@@ -166,10 +166,10 @@ def machine(config: TrainConfig) -> dict[str, str]:
 def metadata(config: TrainConfig, step: int, elapsed_s: float, validation: Validation) -> dict[str, str]:
     """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
 
-    `calibration` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on
-    the held-out towns: what a localizer sets its absolute gate by.
+    `distances` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on the
+    held-out towns, `credibility` what the localizer makes of distances.
     """
-    calibration = {
+    distances = {
         "quantiles": QUANTILES,
         "true_match": validation.true_distances,
         "best_false_match": validation.false_distances,
@@ -179,7 +179,8 @@ def metadata(config: TrainConfig, step: int, elapsed_s: float, validation: Valid
     recalls = {f"{r.label}@{r.radius_m:.0f}m": round(r.value, 4) for r in validation.recalls}
     training = {"steps": step, "hours": round(elapsed_s / 3600.0, 3), "pairs": config.pairs, "seed": config.seed}
     return {
-        "calibration": json.dumps(calibration),
+        "credibility": json.dumps(to_dict(validation.calibration)),
+        "distances": json.dumps(distances),
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
     }

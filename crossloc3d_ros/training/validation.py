@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from crossloc3d_ros.config import CalibrationConfig
+from crossloc3d_ros.localization.credibility import calibrate
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
@@ -53,6 +55,8 @@ class Validation:
     """Quantiles (`QUANTILES`) of the descriptor distance from a scan to the submap that is centred nearest."""
     false_distances: tuple[float, ...]
     """The same to the nearest descriptor among the submaps more than 100 m away."""
+    calibration: CalibrationConfig
+    """What the localizer should make of the distances."""
 
     def recall(self, label: str, radius_m: float) -> Recall:
         """Return one figure, as `recall("R@1", 100.0)`."""
@@ -106,7 +110,24 @@ def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validatio
         recalls=tuple(recalls),
         true_distances=_quantiles(true),
         false_distances=_quantiles(false),
+        calibration=fit_calibration(descriptor_distances, metres),
     )
+
+
+def fit_calibration(descriptor_distances: Float64Array, metres: Float64Array) -> CalibrationConfig:
+    """Fit what the localizer believes to the same matrices.
+
+    Every query counts twice: against the whole database, and against the database without its own town. The second
+    is a robot outside of the map, which must learn to be told so.
+    """
+    distances, separations_m = [], []
+    for near, apart in zip(descriptor_distances, metres, strict=True):
+        for allowed in (np.ones(len(apart), np.bool_), np.isinf(apart)):
+            if allowed.any():
+                best = np.argsort(near[allowed], kind="stable")[: max(TOP)]
+                distances.append(near[allowed][best].astype(np.float32))
+                separations_m.append(apart[allowed][best])
+    return calibrate(distances, separations_m)
 
 
 def validate(towns: Sequence[ValidationTown], encode: Callable[[list[Float32Array]], Float32Array]) -> Validation:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from crossloc3d_ros.cli import train
-from crossloc3d_ros.config import TrainConfig
+from crossloc3d_ros.config import CalibrationConfig, TrainConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_checkpoint
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
@@ -76,8 +76,10 @@ def test_a_finished_run_leaves_weights_that_load_with_their_calibration_and_a_ca
     checkpoint = load_checkpoint(finished / run_folder.FINAL)
     assert checkpoint.model.config == tiny.model
     assert checkpoint.preprocessing == tiny.preprocessing
-    calibration = json.loads(checkpoint.metadata["calibration"])
-    assert len(calibration["true_match"]) == len(calibration["quantiles"])
+    distances = json.loads(checkpoint.metadata["distances"])
+    assert len(distances["true_match"]) == len(distances["quantiles"])
+    calibration = from_dict(CalibrationConfig, json.loads(checkpoint.metadata["credibility"]))
+    assert calibration.temperature > 0.0
     card = (finished / run_folder.MODEL_CARD).read_text()
     for words in ("R@1", "chance", "--budget-steps 2", "seed 1", "What it cannot do"):
         assert words in card
