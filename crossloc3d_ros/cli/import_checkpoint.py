@@ -44,3 +44,7 @@ def _import(arguments: argparse.Namespace) -> int:
     parameters = sum(p.numel() for p in written.model.parameters())
     print(f"wrote {arguments.output}: {parameters:,} parameters, fingerprint {written.fingerprint}")
     return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

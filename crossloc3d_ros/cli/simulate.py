@@ -109,3 +109,7 @@ def _drive(
     )  # fmt: skip
     config = common.read_options(DriveConfig, arguments)
     return drive(world, route, bag_path, config, seed=arguments.seed, storage=arguments.storage, progress=progress)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
