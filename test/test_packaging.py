@@ -37,6 +37,14 @@ def test_every_command_is_a_module_with_a_main_and_every_such_module_a_command()
         assert callable(importlib.import_module(f"crossloc3d_ros.cli.{name}").main)
 
 
+@pytest.mark.parametrize("name", commands())
+def test_every_command_explains_itself(name: str) -> None:
+    call = [sys.executable, "-m", f"crossloc3d_ros.cli.{name}", "--help"]
+    result = subprocess.run(call, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(f"usage: {name}")
+
+
 def test_there_is_one_version() -> None:
     package = ElementTree.parse(REPOSITORY / "package.xml").getroot()
     assert package.findtext("version") == crossloc3d_ros.__version__
