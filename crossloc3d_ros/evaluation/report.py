@@ -101,7 +101,9 @@ def _verdict(table: EstimateTable, scores: Scores | None) -> str:
         return f"{given}. The recording says nothing of where the robot really was, so none of them could be checked."
     five = scores.recall(5, 50.0)
     text = f"Without being told where to start: {given[0].lower()}{given[1:]}"
-    if scores.fix_error.count:
+    if 0 < scores.fix_error.count < 20:
+        text += f", off by <b>{_metres(scores.fix_error.median_m)}</b> in the median"
+    elif scores.fix_error.count:
         text += (
             f", half of these within <b>{_metres(scores.fix_error.median_m)}</b> of the truth "
             f"and 95 % within {_metres(scores.fix_error.p95_m)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from crossloc3d_ros.errors import BagError
 from crossloc3d_ros.formats.bag import NAV_SAT_FIX, BagReader, stamp_ns_of
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import Float64Array, Int64Array
+
+log = logging.getLogger(__name__)
 
 MAX_STD_M = 10.0
 """A fix whose receiver doubts it by more than this horizontally is no truth."""
@@ -73,17 +76,23 @@ def find_truth_topic(bag: BagReader, chosen: str | None) -> str | None:
 def read_truth(bag: BagReader, topic: str, frame: MapFrame) -> TruthTrack:
     """Read the usable fixes of a NavSatFix topic.
 
-    The antenna is taken for the robot: its lever arm is small against the distances that are scored.
+    The antenna is taken for the robot: its lever arm is small against the distances that are scored. Of a recording
+    that breaks off the fixes before the break are returned; BagError where there are none.
     """
     stamps: list[int] = []
     positions: list[tuple[float, float, float]] = []
     dropped = 0
-    for _, recorded_ns, fix in bag.messages([topic]):
-        if not _usable(fix.status.status, fix.latitude, fix.longitude) or _std_m(fix) > MAX_STD_M:
-            dropped += 1
-            continue
-        stamps.append(stamp_ns_of(fix, recorded_ns))
-        positions.append((float(fix.latitude), float(fix.longitude), float(fix.altitude)))
+    try:
+        for _, recorded_ns, fix in bag.messages([topic]):
+            if not _usable(fix.status.status, fix.latitude, fix.longitude) or _std_m(fix) > MAX_STD_M:
+                dropped += 1
+                continue
+            stamps.append(stamp_ns_of(fix, recorded_ns))
+            positions.append((float(fix.latitude), float(fix.longitude), float(fix.altitude)))
+    except BagError as error:
+        if not stamps:
+            raise
+        log.warning("the truth ends early: %s", error)
     stamp_ns, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)  # sorts, too
     table = np.array(positions, dtype=np.float64).reshape(-1, 3)[first]
     grid = frame.from_geographic(table[:, 0], table[:, 1], table[:, 2]) if len(table) else np.empty((0, 3))

@@ -106,3 +106,22 @@ def test_which_topic_is_the_truth(tmp_path: Path) -> None:
         pytest.raises(BagError, match=r"/gnss/left, /gnss/right\); choose one with --gnss-topic"),
     ):
         find_truth_topic(reader, None)
+
+
+def test_of_a_recording_that_breaks_off_the_whole_part_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_gnss(tmp_path / "drive", [(i, fix_at(i, 628_700.0 + 10 * i)) for i in range(6)])
+    with bag.open_bag(path) as reader:
+        whole = list(reader.messages())
+
+        def broken(count: int):
+            yield from whole[:count]
+            raise BagError("cannot read drive.db3")
+
+        monkeypatch.setattr(reader, "messages", lambda topics: broken(3))
+        assert len(read_truth(reader, "/gnss", FRAME)) == 3
+        assert "the truth ends early" in caplog.text
+        monkeypatch.setattr(reader, "messages", lambda topics: broken(0))
+        with pytest.raises(BagError, match=r"drive\.db3"):
+            read_truth(reader, "/gnss", FRAME)
