@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crossloc3d_ros.config import CalibrationConfig
+from crossloc3d_ros.evaluation.recall import chance_of_hit, wilson_share
 from crossloc3d_ros.localization.credibility import calibrate
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
@@ -71,16 +72,6 @@ def ground_distances(queries: Places, submaps: Places) -> Float64Array:
     return distances
 
 
-def wilson_interval(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """Return the 95 % interval of a share."""
-    if count == 0:
-        return 0.0, 1.0
-    share = hits / count
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    return max(0.0, centre - half), min(1.0, centre + half)
-
-
 def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validation:
     """Return recall and distances from both (Q, M) matrices: descriptor units and metres on the ground.
 
@@ -99,9 +90,9 @@ def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validatio
         matches = right.sum(axis=1)
         for label, count in [*((f"R@{k}", k) for k in TOP), ("R@1%", one_per_cent)]:
             hits = int((first < count).sum())
-            chance = float(np.mean([_chance(int(m), submaps, count) for m in matches])) if len(matches) else 0.0
-            low, high = wilson_interval(hits, len(first))
-            recalls.append(Recall(radius_m, count, label, hits / max(1, len(first)), chance, low, high))
+            chance = float(chance_of_hit(matches, submaps, count).mean()) if len(matches) else 0.0
+            share = wilson_share(hits / max(1, len(first)), len(first))
+            recalls.append(Recall(radius_m, count, label, share.value, chance, share.low, share.high))
     true = np.take_along_axis(descriptor_distances, metres.argmin(axis=1)[:, None], axis=1)[:, 0]
     false = np.where(metres > max(RADII_M), descriptor_distances, math.inf).min(axis=1)
     return Validation(
@@ -151,12 +142,3 @@ def _quantiles(distances: Float64Array) -> tuple[float, ...]:
 
 def _towns(counts: Sequence[int]) -> Int64Array:
     return np.repeat(np.arange(len(counts), dtype=np.int64), counts)
-
-
-def _chance(matches: int, submaps: int, count: int) -> float:
-    """Return the probability that `count` of `submaps` drawn at random hold one of the `matches`."""
-    if matches + count > submaps:
-        return 1.0
-    miss = math.lgamma(submaps - matches + 1) - math.lgamma(submaps - matches - count + 1)
-    miss += math.lgamma(submaps - count + 1) - math.lgamma(submaps + 1)
-    return 1.0 - math.exp(miss)

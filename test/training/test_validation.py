@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from crossloc3d_ros.training.validation import Places, ground_distances, score, wilson_interval
+from crossloc3d_ros.training.validation import Places, ground_distances, score
 
 
 def places(town: list[int], xy: list[tuple[float, float]]) -> Places:
@@ -42,11 +42,3 @@ def test_chance_is_what_random_descriptors_reach() -> None:
 def test_the_true_one_per_cent_grows_with_the_database() -> None:
     result = score(np.random.default_rng(0).random((3, 730)), np.full((3, 730), 10.0))
     assert result.recall("R@1%", 100.0).count == 8
-
-
-def test_the_interval_holds_the_share_and_shrinks_with_more_queries() -> None:
-    low, high = wilson_interval(30, 100)
-    assert low < 0.3 < high
-    wide = wilson_interval(3, 10)
-    assert wide[1] - wide[0] > high - low
-    assert wilson_interval(0, 0) == (0.0, 1.0)
