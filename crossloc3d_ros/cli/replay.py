@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -27,7 +28,7 @@ from crossloc3d_ros.cli.common import (
 from crossloc3d_ros.config import LocalizerNodeConfig, MountingConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
-from crossloc3d_ros.evaluation.recall import RADII_M, RANKS
+from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS
 from crossloc3d_ros.evaluation.replay import (
     ESTIMATES,
     GEOJSON,
@@ -59,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(lambda: _publish(arguments, ros_arguments))
     if ros_arguments:
         parser.error(f"{ROS_ARGUMENTS} has a meaning with --publish only")
-    if arguments.map is None:
+    if arguments.map is None and arguments.config is None:
         parser.error("--map is needed, the folder that build_map wrote (or --publish, to play into ROS)")
     return run(lambda: _replay(arguments))
 
@@ -78,12 +79,14 @@ def _parser() -> argparse.ArgumentParser:
     localize = parser.add_argument_group("localize and score")
     localize.add_argument("--map", type=Path, help="folder of the aerial map")
     localize.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
-    localize.add_argument("--device", default="cpu", help="where to encode: cpu or cuda (default: %(default)s)")
+    localize.add_argument("--device", help="where to encode: cpu or cuda (default: cpu)")
     localize.add_argument("--gnss-topic", help="NavSatFix topic to score against (default: ground truth, or the only)")
     localize.add_argument("--imu-topic", help="Imu topic, axes of the base, to level the scans by (default: none)")
     localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
     localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
-    localize.add_argument("--config", type=Path, help="parameter file of the localizer node, such as localizer.yaml")
+    localize.add_argument(
+        "--config", type=Path, help="parameter file of the localizer node; what is given here is stronger"
+    )
 
     mounting = parser.add_argument_group("mounting of the lidar on the robot (stronger than --config)")
     add_options(mounting, MountingConfig)  # type: ignore[arg-type]  # a group takes arguments as a parser does
@@ -106,7 +109,9 @@ def _replay(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--every must be at least 1, got {arguments.every}")
     target = console()
     set_up_logging(arguments.verbose, target)
-    config = read_config(arguments.config, _mounting_of(arguments))
+    config = read_config(arguments.config, _given(arguments, MountingConfig), _given(arguments, LocalizerNodeConfig))
+    if not config.map:
+        raise ConfigError(f"--map is needed: {arguments.config} names none")
     folder = arguments.output or Path("out") / "replay" / arguments.bag.resolve().stem
     broken: BagError | None = None
     interrupted = False
@@ -116,8 +121,9 @@ def _replay(arguments: argparse.Namespace) -> int:
         find_truth_topic(bag, arguments.gnss_topic)
         if arguments.imu_topic is not None:
             bag.topic(arguments.imu_topic, IMU)
-        encoder = load_encoder(arguments.weights, device=arguments.device)
-        aerial_map = AerialMap.load(arguments.map, encoder.fingerprint)
+        weights = Path(config.weights) if config.weights else None
+        encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
+        aerial_map = AerialMap.load(config.map, encoder.fingerprint)
         localizer = Localizer(aerial_map, encoder, config)
         remove_results(folder)
         target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps")
@@ -147,7 +153,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     facts = {
         "bag": str(arguments.bag),
         "topic": topic,
-        "map": str(arguments.map),
+        "map": config.map,
         "weights": encoder.fingerprint[:12],
         "run": "straight through the localizer",
     }
@@ -157,7 +163,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     if interrupted:
         notes.append("The run was interrupted; only the scans before that are shown.")
     write_results(folder, evaluation, aerial_map, About(f"Replay of {arguments.bag.name}", facts, tuple(notes)))
-    Console(highlight=False).print(results_table(evaluation))
+    print_results(evaluation, Console(highlight=False))
     print(f"{folder / PAGE}\n{folder / ESTIMATES}\n{folder / GEOJSON}")
     if broken is not None:
         raise broken
@@ -189,38 +195,43 @@ def write_results(folder: Path, evaluation: Evaluation, aerial_map: AerialMap, a
     write_report(folder / PAGE, evaluation, aerial_map, about)
 
 
-def results_table(evaluation: Evaluation) -> Table:
-    """Return the scores as a table for the terminal."""
+def print_results(evaluation: Evaluation, target: Console) -> None:
+    """Print the scores for people."""
     table, scores = evaluation.table, evaluation.scores
-    result = Table(title="Results", title_justify="left", show_header=False, pad_edge=False)
-    result.add_column(style="bold")
-    result.add_column()
+    figures = Table(title="Results", title_justify="left", show_header=False, box=box.SIMPLE)
+    figures.add_column(style="bold", no_wrap=True)
+    figures.add_column()
     fixes = int(table.has_fix.sum())
-    result.add_row("scans", f"{len(table):,}, of which {fixes:,} led to a fix ({fixes / max(len(table), 1):.0%})")
+    figures.add_row("scans", f"{len(table):,}, of which {fixes:,} led to a fix ({fixes / max(len(table), 1):.0%})")
     latency = latency_summary(table)
     if latency:
-        result.add_row("time a scan", f"median {latency['median']:.1f} ms, 95 % {latency['p95']:.1f} ms")
+        figures.add_row("time a scan", f"median {latency['median']:.1f} ms, 95 % {latency['p95']:.1f} ms")
     if scores is None:
-        result.add_row("errors", "not known: the recording has no usable GNSS at the time of the scans")
-        return result
+        figures.add_row("errors", "not known: the recording has no usable GNSS at the time of the scans")
+        target.print(figures)
+        return
     error, first = scores.fix_error, scores.best_candidate_error
     if error.count:
-        result.add_row("error of a fix", f"median {error.median_m:.0f} m, 95 % {error.p95_m:.0f} m")
-        result.add_row("truth in 95 % ellipse", f"{error.within_ellipse:.0%} of the fixes")
+        figures.add_row("error of a fix", f"median {error.median_m:.0f} m, 95 % {error.p95_m:.0f} m")
+        figures.add_row("truth in the 95 % ellipse", f"{error.within_ellipse:.0%} of the fixes")
     if first.count:
-        result.add_row("error of first candidate", f"median {first.median_m:.0f} m, 95 % {first.p95_m:.0f} m")
+        figures.add_row("error of first candidate", f"median {first.median_m:.0f} m, 95 % {first.p95_m:.0f} m")
+    figures.add_row("evidence", f"{scores.places} places at least {INDEPENDENT_M:g} m apart")
+    target.print(figures)
+    recall = Table(title="Right place among the candidates", title_justify="left", box=box.SIMPLE)
+    recall.add_column("", style="bold", no_wrap=True)
+    for radius in RADII_M:
+        recall.add_column(f"within {radius:g} m", justify="right", no_wrap=True)
     for rank in RANKS:
         cells = [scores.recall(rank, radius) for radius in RADII_M]
-        text = "   ".join(
-            f"{cell.share.value:4.0%} within {cell.radius_m:g} m (by lot {cell.chance:.0%})" for cell in cells
-        )
-        result.add_row(f"AR@{rank}", text)
-    result.add_row("evidence", f"{scores.places} places at least 25 m apart")
-    return result
+        recall.add_row(f"AR@{rank}", *(f"{cell.share.value:.0%} (by lot {cell.chance:.0%})" for cell in cells))
+    target.print(recall)
 
 
-def read_config(path: Path | None, mounting: Mapping[str, float]) -> LocalizerNodeConfig:
-    """Return the localizer's settings from a node's parameter file, the mounting given on the command line on top.
+def read_config(
+    path: Path | None, mounting: Mapping[str, Any], others: Mapping[str, Any] | None = None
+) -> LocalizerNodeConfig:
+    """Return the localizer's settings from a node's parameter file, with `mounting` and `others` on top.
 
     Understands `ros__parameters` under the node's name or a wildcard, nested or with dots; ConfigError names what is
     wrong.
@@ -235,6 +246,7 @@ def read_config(path: Path | None, mounting: Mapping[str, float]) -> LocalizerNo
     if mounting:
         scan = values.setdefault("scan", {})
         scan["mounting"] = {**scan.get("mounting", {}), **mounting}
+    values.update(others or {})
     return from_dict(LocalizerNodeConfig, values)
 
 
@@ -265,9 +277,10 @@ def _merge(target: dict[str, Any], source: Mapping[str, Any]) -> None:
         target[head] = value
 
 
-def _mounting_of(arguments: argparse.Namespace) -> dict[str, float]:
-    names = MountingConfig.__dataclass_fields__
-    return {name: vars(arguments)[name] for name in names if vars(arguments).get(name) is not None}
+def _given(arguments: argparse.Namespace, kind: type[Any]) -> dict[str, Any]:
+    """Return the arguments that are settings of `kind` and were given."""
+    given = {name: vars(arguments).get(name) for name in kind.__dataclass_fields__}
+    return {name: str(v) if isinstance(v, Path) else v for name, v in given.items() if v is not None}
 
 
 def own_version() -> str:

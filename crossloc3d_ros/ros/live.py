@@ -124,7 +124,7 @@ def localize_live(
     *,
     parameters: Mapping[str, str] | None = None,
     log_path: Path | None = None,
-    startup_s: float = 180.0,
+    startup_s: float = 300.0,
     domain: int | None = None,
     on_started: Callable[[float], None] = lambda _: None,
     progress: Callable[[int, int, Estimate | None], None] = lambda done, total, newest: None,

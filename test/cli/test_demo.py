@@ -1,0 +1,121 @@
+"""The demo's steps: what is current is not made again, and what is missing is named; all of it where time allows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from crossloc3d_ros.cli import demo
+from crossloc3d_ros.errors import MapError
+from crossloc3d_ros.evaluation.estimates import EstimateTable
+from crossloc3d_ros.geodesy import MapFrame
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def test_the_surveys_of_the_clone_are_found() -> None:
+    folder = demo.find_surveys(None)
+    assert (folder / demo.MAP_SURVEY).stat().st_size + (folder / demo.DRIVE_SURVEY).stat().st_size < 8_000_000
+
+
+def test_missing_surveys_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MapError, match=r"does not hold ahn2_2010\.laz and ahn3_2014\.laz"):
+        demo.find_surveys(tmp_path)
+    pytest.importorskip("rclpy")
+    assert demo.main(["--surveys", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
+    assert "--surveys" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_current_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, folder, target = tmp_path / "s.laz", tmp_path / "map", Console(quiet=True)
+    survey.write_bytes(b"one")
+    built: list[str] = []
+
+    def build_map(inputs: list[Path], output: Path, *_: object, **__: object) -> None:
+        built.append(inputs[0].read_text())
+        output.mkdir(exist_ok=True)
+
+    monkeypatch.setattr(demo, "build_map", build_map)
+    monkeypatch.setattr(demo, "read_manifest", lambda folder: object())
+    demo.make_map(survey, folder, None, "weights-1", target)
+    demo.make_map(survey, folder, None, "weights-1", target)
+    assert built == ["one"]
+    demo.make_map(survey, folder, None, "weights-2", target)
+    survey.write_bytes(b"two")
+    demo.make_map(survey, folder, None, "weights-2", target)
+    assert built == ["one", "one", "two"]
+    (tmp_path / "map.made-from.json").write_text("{")
+    demo.make_map(survey, folder, None, "weights-2", target)
+    assert len(built) == 4
+
+
+def test_an_interrupted_build_is_not_taken_for_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, folder, target = tmp_path / "s.laz", tmp_path / "map", Console(quiet=True)
+    survey.write_bytes(b"one")
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "build_map", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        demo.make_map(survey, folder, None, "weights", target)
+    assert list(tmp_path.glob("*.made-from.json")) == []
+
+
+def test_fixes_stand_beside_the_truth() -> None:
+    frame = MapFrame("EPSG:32631", np.array([628_700.0, 5_803_600.0, 2.0]), 43.0)
+    count = 121
+    truth = np.column_stack([628_700.0 + np.arange(count), np.full(count, 5_803_600.0)])
+    grid = np.column_stack([truth + np.array([30.0, 40.0]), np.zeros(count)])
+    latitude, longitude, altitude = frame.to_geographic(grid)
+    table = EstimateTable(
+        stamp_ns=np.arange(count) * 100_000_000,
+        has_fix=np.arange(count) < 60,
+        geographic=np.column_stack([latitude, longitude, altitude]),
+        grid=grid,
+        covariance=np.zeros((count, 3, 3)),
+        timings_ms=np.full((count, 4), 21.0),
+        points=np.zeros((count, 2), dtype=np.int64),
+        candidate_ids=np.zeros((count, 1), dtype=np.int64),
+        candidate_distances=np.zeros((count, 1)),
+        candidate_probabilities=np.full((count, 1), 0.75),
+        candidate_grid=truth[:, None] + np.array([0.0, 12.0]),
+        truth_grid=truth,
+        reasons=("",) * count,
+    )
+    console = Console(width=80, record=True, quiet=True)
+    with console.capture():
+        console.print(demo.beside_the_truth(table, frame))
+    lines = console.export_text().splitlines()
+    assert max(len(line) for line in lines) <= 80
+    rows = [line.split() for line in lines if " s " in line]
+    assert len(rows) == 3  # every five seconds of twelve
+    assert [("50" in row) for row in rows] == [True, True, False]
+    assert "no fix" in lines[-2] or "no fix" in lines[-3]
+    assert all("12" in row and "75%" in row for row in rows)
+    assert f"{latitude[0]:.5f}," in rows[0]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_whole_demo_on_a_short_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rclpy")
+    arguments = ["--output", str(tmp_path), "--length-m", "60", "--speed-m-s", "4"]
+    assert demo.main(arguments) == 0
+    said = capsys.readouterr()
+    for word in ("Fixes beside the truth", "AR@25", str(tmp_path / "index.html")):
+        assert word in said.out
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["scans"] > 100
+    assert summary["scores"]["scored"] == summary["scans"]
+    page = (tmp_path / "index.html").read_text()
+    assert "simulated" in page
+    before = (tmp_path / "map" / "manifest.json").stat().st_mtime_ns, (tmp_path / "drive").stat().st_mtime_ns
+    assert demo.main(arguments) == 0
+    assert before == ((tmp_path / "map" / "manifest.json").stat().st_mtime_ns, (tmp_path / "drive").stat().st_mtime_ns)
+    assert capsys.readouterr().err.count("current, not") == 2

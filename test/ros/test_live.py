@@ -1,0 +1,100 @@
+"""The demo's engine: the localizer as a process, a recording played into it, its answers as estimates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.evaluation.estimates import read_estimates
+from crossloc3d_ros.formats import bag
+from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.ros.live import header_stamp_ns, localize_live
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 250_000_000
+SCANS = 12
+
+
+def write_drive(path: Path, world: Any) -> Path:
+    with bag.BagWriter(path) as writer:
+        writer.add_topic("/lidar/points", bag.POINT_CLOUD, bag.OfferedQos("best_effort", "volatile", 5))
+        for place in range(SCANS):
+            stamp_ns = START_NS + place * STEP_NS
+            points = world.points(place) if place != 5 else np.full((100, 3), np.nan)
+            cloud = bag.velodyne_cloud(stamp_ns, "velodyne", points, 1.0, 0, 0.0)
+            writer.write("/lidar/points", bag.POINT_CLOUD, stamp_ns, cloud)
+    return path
+
+
+def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, domain: int, tmp_path: Path) -> None:
+    parameters = {name: str(value) for name, value in world.parameters().items() if name != "map"}
+    frame = AerialMap.load(world.map_path).frame
+    calls: list[tuple[int, int]] = []
+    with bag.open_bag(write_drive(tmp_path / "drive", world)) as reader:
+        report = localize_live(
+            reader,
+            "/lidar/points",
+            world.map_path,
+            frame,
+            tmp_path / "estimates.csv",
+            parameters=parameters,
+            log_path=tmp_path / "localizer.log",
+            domain=domain,
+            progress=lambda done, total, _: calls.append((done, total)),
+        )
+    table = read_estimates(tmp_path / "estimates.csv")
+    assert calls == [(i + 1, SCANS) for i in range(SCANS)]
+    assert report.scans == SCANS
+    assert table.stamp_ns.tolist() == [START_NS + i * STEP_NS for i in range(SCANS)]
+    answered = np.isfinite(table.timings_ms[:, 3])
+    assert report.answers == answered.sum() >= SCANS - 3  # a busy machine may drop some
+    assert (table.timings_ms[answered, 3] > 0).all()
+    assert answered[5]
+    assert not table.has_fix[5]
+    assert table.candidate_ids[5, 0] == -1
+    good = answered & (np.arange(SCANS) != 5)
+    assert table.has_fix[good].mean() > 0.7
+    for i in np.flatnonzero(good):
+        assert table.candidate_ids[i, 0] == i
+        np.testing.assert_allclose(table.candidate_grid[i, 0], world.grid(i)[:2], atol=0.05)
+        assert table.candidate_probabilities[i, 0] > table.candidate_probabilities[i, 1]
+        if table.has_fix[i]:
+            assert np.hypot(*(table.grid[i, :2] - world.grid(i)[:2])) < 60.0
+            assert table.covariance[i, 0, 0] > 0
+            assert table.reasons[i]
+    for i in np.flatnonzero(~answered):
+        assert "no answer" in table.reasons[i]
+
+
+def test_a_node_that_does_not_come_up_says_why(world: Any, ros_environment: Any, domain: int, tmp_path: Path) -> None:
+    frame = MapFrame("EPSG:32631", np.array([628_500.0, 5_804_000.0, 2.0]), None)
+    with (
+        bag.open_bag(write_drive(tmp_path / "drive", world)) as reader,
+        pytest.raises(CrossLocError, match=r"the localizer ended with code 2: .*manifest\.json.*localizer\.log"),
+    ):
+        localize_live(
+            reader,
+            "/lidar/points",
+            tmp_path,
+            frame,
+            tmp_path / "e.csv",
+            parameters={"weights": str(world.weights_path)},
+            log_path=tmp_path / "localizer.log",
+            domain=domain,
+        )
+    assert not (tmp_path / "e.csv").exists()
+
+
+def test_stamps_are_read_from_serialised_messages(tmp_path: Path) -> None:
+    stamps = [1, 999_999_999, 1_700_000_000_123_456_789, 2_147_483_647_000_000_001]
+    with bag.BagWriter(tmp_path / "drive") as writer:
+        for stamp_ns in stamps:
+            cloud = bag.velodyne_cloud(stamp_ns, "velodyne", np.zeros((1, 3)), 1.0, 0, 0.0)
+            writer.write("/points", bag.POINT_CLOUD, stamp_ns, cloud)
+    with bag.open_bag(tmp_path / "drive") as reader:
+        assert [header_stamp_ns(message.cdr) for message in reader.raw_messages()] == stamps
