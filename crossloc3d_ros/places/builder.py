@@ -270,6 +270,8 @@ def _continue_or_start(work: Path, job: dict[str, Any]) -> bool:
         earlier = None
     if earlier == job:
         _log.info("continuing the build in %s", work)
+        for leftover in (work / "tiles").glob("*.partial"):  # of a process that was killed while it wrote
+            leftover.unlink()
         return True
     if earlier is not None:
         changed = sorted(key for key in {*earlier, *job} if earlier.get(key) != job.get(key))

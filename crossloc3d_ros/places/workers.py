@@ -206,12 +206,16 @@ def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))  # read by the libraries when a worker imports them
     executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(receiver,))
+    others = set(multiprocessing.active_children())
     try:
+        _start_all(executor, workers)
         yield executor
         executor.shutdown()
     finally:
-        sender.close()  # whatever still runs ends now: its result would only be done again
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()  # whatever still runs was not wanted any more; pieces of work are whole or not there
         executor.shutdown(cancel_futures=True)
+        sender.close()
         receiver.close()
         for name, value in before.items():
             if value is None:
@@ -220,9 +224,22 @@ def _process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
+def _start_all(executor: ProcessPoolExecutor, workers: int) -> None:
+    """Start the processes with Ctrl-C blocked, which they inherit: it is the parent's business from the beginning."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for _ in range(workers):
+            executor.submit(_nothing)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _nothing() -> None:
+    """Make the executor start a process."""
+
+
 def _start_worker(parent: Connection) -> None:
-    """Leave Ctrl-C to the parent, and end when the parent closes the pipe or dies in whatever way."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End when the parent dies in whatever way, which closes its end of the pipe."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def watch() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -18,10 +19,10 @@ import pytest
 from crossloc3d_ros.config import BuildConfig, ModelConfig, PreprocessingConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder, save_checkpoint
 from crossloc3d_ros.encoder.model import CrossLoc3D
-from crossloc3d_ros.errors import AerialDataError, ConfigError
+from crossloc3d_ros.errors import AerialDataError, ConfigError, CrossLocError
 from crossloc3d_ros.formats.las import write_laz
 from crossloc3d_ros.places import store
-from crossloc3d_ros.places.builder import build_map, work_folder
+from crossloc3d_ros.places.builder import BuildProgress, build_map, work_folder
 from crossloc3d_ros.places.store import AerialMap
 
 
@@ -143,6 +144,27 @@ def test_workers_end_with_their_parent(tmp_path: Path, weights: Path, town: Any,
     _, alive = psutil.wait_procs(family, timeout=15)
     assert alive == []
     assert not (tmp_path / "map").exists() and any((work_folder(tmp_path / "map") / "tiles").glob("*.npz"))
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_said_and_loses_nothing(
+    tmp_path: Path, weights: Path, survey_file: Path, alone: Path
+) -> None:
+    others = set(multiprocessing.active_children())
+    killed = False
+
+    def kill_one(progress: BuildProgress) -> None:
+        nonlocal killed
+        if progress.stage == "encoding" and progress.done > 0 and not killed:
+            (set(multiprocessing.active_children()) - others).pop().kill()
+            killed = True
+
+    loader = functools.partial(load_encoder, weights, threads=1)
+    config = BuildConfig(tile_m=76.0, workers=2)
+    with pytest.raises(CrossLocError, match=r"a worker process died.*what is done is kept"):
+        build_map([survey_file], tmp_path / "town", loader, config, progress=kill_one)
+    assert build_map([survey_file], tmp_path / "town", load_encoder(weights), BuildConfig(tile_m=76.0)).resumed
+    assert_same_map(tmp_path / "town", alone)
 
 
 MEASURE = """
