@@ -199,7 +199,7 @@ def make_drive(survey: Path, bag_path: Path, plan: DemoDrive, target: Console) -
 
 def beside_the_truth(table: EstimateTable, frame: MapFrame) -> Table:
     """Return fixes and truth side by side, a scan every few seconds."""
-    result = Table(title="Fixes beside the truth", title_justify="left", box=box.SIMPLE, padding=(0, 1))
+    result = Table(title="Fixes beside the truth", title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     for name in ("time", "truth", "fix", "off by", "1st cand.", "belief", "latency"):
         result.add_column(name, justify="right", no_wrap=True)
     if not len(table):
