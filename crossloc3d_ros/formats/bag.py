@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -70,6 +71,9 @@ VELODYNE_POINT = np.dtype(
     }
 )
 _POINT_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+# A full disk reaches us as the one or the other, depending on the storage.
+_DISK_ERRORS = (OSError, sqlite3.Error)
 
 ReliabilityName = Literal["reliable", "best_effort", "unknown"]
 DurabilityName = Literal["volatile", "transient_local", "unknown"]
@@ -286,7 +290,7 @@ class BagWriter:
             plugin = StoragePlugin.MCAP if self.storage == "mcap" else StoragePlugin.SQLITE3
             self._writer = Writer(self._folder / self.path.name, version=9, storage_plugin=plugin)
             self._writer.open()
-        except OSError as error:
+        except _DISK_ERRORS as error:
             self._remove()
             raise BagError(f"cannot write {self.path}: {error}") from error
         return self
@@ -302,8 +306,9 @@ class BagWriter:
                 writer.close()
                 (self._folder / self.path.name).rename(self.path)
             else:
-                writer.abort()
-        except OSError as failure:
+                with suppress(*_DISK_ERRORS):  # what went wrong before is what matters
+                    writer.abort()
+        except _DISK_ERRORS as failure:
             raise BagError(f"cannot write {self.path}: {failure}") from failure
         finally:
             self._remove()
@@ -323,7 +328,7 @@ class BagWriter:
         try:
             data = _jazzy().serialize_cdr(message, msgtype)
             self._open_writer().write(self._connections[topic], int(stamp_ns), data)
-        except OSError as error:
+        except _DISK_ERRORS as error:
             raise BagError(f"cannot write {self.path}: {error}") from error
 
     def _open_writer(self) -> Writer:

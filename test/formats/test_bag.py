@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -287,3 +289,29 @@ def test_odometry_imu_and_pose_keep_their_numbers(tmp_path: Path) -> None:
     assert (imu.linear_acceleration.z, imu.angular_velocity.y) == (9.81, 0.2)
     assert imu.orientation_covariance[0] == -1.0  # REP-145: no orientation is given
     assert (pose.pose.position.z, pose.header.frame_id) == (3.0, "map")
+
+
+FILL_THE_DISK = """
+import resource, sys
+import numpy as np
+from crossloc3d_ros.errors import BagError
+from crossloc3d_ros.formats import bag
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+cloud = bag.velodyne_cloud(1, "velodyne", np.zeros((20_000, 3)), 1.0, 3, 0.0)
+try:
+    with bag.BagWriter(sys.argv[1], sys.argv[2]) as writer:
+        for i in range(20):
+            writer.write("/points", bag.POINT_CLOUD, i, cloud)
+except BagError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path: Path, storage: bag.Storage) -> None:
+    path = tmp_path / "drive"
+    done = subprocess.run(
+        [sys.executable, "-c", FILL_THE_DISK, str(path), storage], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.startswith(f"cannot write {path}: "), done.stderr
+    assert list(tmp_path.iterdir()) == []
