@@ -176,7 +176,7 @@
     play(false); select(best);
   });
   document.addEventListener("keydown", event => {
-    if (event.target.closest("input, button, a") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if ((event.target instanceof Element && event.target.closest("input, button, a")) || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.key === "ArrowRight") { play(false); select(index + 1); }
     else if (event.key === "ArrowLeft") { play(false); select(index - 1); }
     else return;
