@@ -470,6 +470,7 @@ def run_localizer(arguments: Sequence[str]) -> int:
     executor = SingleThreadedExecutor()
     node: LocalizerNode | None = None
     handler: logging.Handler | None = None
+    code = EXIT_ERROR
     try:
         surplus = remove_ros_args(["localizer", *arguments])[1:]
         if surplus:
@@ -481,9 +482,8 @@ def run_localizer(arguments: Sequence[str]) -> int:
         executor.add_node(node)
         while not node.failure:
             executor.spin_once(timeout_sec=SPIN_S)
-        return EXIT_ERROR
     except KeyboardInterrupt:
-        return 0
+        code = 0
     finally:
         # From here on a second signal would only tear what is being put away in order.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -497,7 +497,8 @@ def run_localizer(arguments: Sequence[str]) -> int:
         rclpy.try_shutdown()
         if not ended:
             # A thread that hangs in compiled code makes the interpreter crash at exit; everything else is put away.
-            os._exit(EXIT_ERROR)
+            os._exit(code)
+    return code
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -79,20 +79,20 @@ class ConfigParameters(Generic[T]):
 
         Raises ConfigError that names what is unknown or wrong; rclpy's own answer leaves the name out.
         """
-        admitted = []
         for parameter in parameters:
-            setting = self._settings.get(parameter.name)
-            if setting is None:
-                if not self._node.has_parameter(parameter.name):
-                    raise ConfigError(self._unknown(parameter.name))
-                admitted.append(parameter)
-                continue
-            reason = self._why_fixed(parameter.name)
-            if reason is not None:
-                raise ConfigError(f"'{parameter.name}' {reason}")
-            value = check_value(parameter.name, setting.hint, _plain(parameter.value), setting.metadata)
-            admitted.append(Parameter(parameter.name, value=_ros(value)))
-        return admitted
+            if parameter.name not in self._settings and not self._node.has_parameter(parameter.name):
+                raise ConfigError(self._unknown(parameter.name))
+        return [self._admit(parameter) for parameter in parameters]
+
+    def _admit(self, parameter: Parameter) -> Parameter:
+        setting = self._settings.get(parameter.name)
+        if setting is None:
+            return parameter
+        reason = self._why_fixed(parameter.name)
+        if reason is not None:
+            raise ConfigError(f"'{parameter.name}' {reason}")
+        value = check_value(parameter.name, setting.hint, _plain(parameter.value), setting.metadata)
+        return Parameter(parameter.name, value=_ros(value))
 
     def _overrides(self) -> dict[str, Any]:
         given = {name: self._value(name) for name in self._node.list_parameters([], 0).names}
@@ -127,8 +127,10 @@ class ConfigParameters(Generic[T]):
         return _plain(self._node.get_parameter(name).value)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        # Called for declarations too, of parameters that nobody knows yet.
         try:
-            self.admit(parameters)
+            for parameter in parameters:
+                self._admit(parameter)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

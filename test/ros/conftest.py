@@ -53,8 +53,9 @@ ORIGIN = (628_500.0, 5_804_000.0, 2.0)
 PLACES = 30
 STAMPS_NS = itertools.count(1_700_000_000_000_000_000, 100_000_000)
 SMALL_MODEL = ModelConfig(
-    channels=16, fused_channels=64, clusters=8, descriptor_size=32, memory_sizes=(32, 16, 16, 16, 8, 8, 8, 8, 8)
-)
+    voxel_sizes=(0.1, 0.4), channels=32, fused_channels=64, clusters=32, descriptor_size=32, sub_steps=1,
+    memory_sizes=(32, 32),
+)  # fmt: skip
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FIRST_ANSWER_S = 240.0
 """What a node may need until it answers: on a busy machine numba compiles for minutes when it first runs."""
@@ -188,7 +189,7 @@ def ros_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> It
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_PYTHON_CHECK_FIELDS": "1",
         "ROS_LOG_DIR": str(tmp_path_factory.mktemp("ros_log")),
-        "OMP_NUM_THREADS": "2",
+        "OMP_NUM_THREADS": "1",
     }
     before = {name: os.environ.get(name) for name in own}
     os.environ.update(own)
