@@ -32,76 +32,82 @@ MAX_DENSE_CELLS = 1 << 24
 """Largest bounding box (in cells) that is looked up in a dense table; beyond it sorted keys are searched."""
 
 
-def _make_tile(n_rows: int) -> Any:
-    """Emit the register tile for `n_rows` input rows against one panel of 16 weight columns."""
+def _make_tile(n_rows: int, *, gathered: bool) -> Any:
+    """Emit the register tile for `n_rows` rows of x against one panel of 16 columns of w.
+
+    `tile(x, w, out, geometry, begin)` works on flat float32 arrays and the rows from `begin` on; a gathered one has
+    `in_rows` and `out_rows` besides, and takes the rows of x and out that stand there from `begin` on. `geometry` is
+    (w_at, depth, x_at, x_row, x_step, w_step, out_at, out_row): row r, depth d of x lies at
+    `x_at + r x_row + d x_step`, depth d of the panel at `w_at + d w_step`, row r of out at `out_at + r out_row`.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        single, lane, word = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+        vector = ir.VectorType(single, COLUMNS)
+        fused = ir.FunctionType(vector, [vector] * 3)
+        fma = cgutils.get_or_insert_function(builder.module, fused, f"llvm.fma.v{COLUMNS}f32")
+        w_at, depth, x_at, x_row, x_step, w_step, out_at, out_row = cgutils.unpack_tuple(builder, args[3], 8)
+
+        def data(position: int) -> Any:
+            return context.make_array(signature.args[position])(context, builder, args[position]).data
+
+        def row(r: int, rows_position: int) -> Any:
+            number = builder.add(args[4], word(r))
+            if gathered:
+                stored = builder.load(builder.gep(data(rows_position), [number]))
+                number = builder.sext(stored, word) if stored.type.width < word.width else stored
+            return number
+
+        def address(base: Any, offset: Any, number: Any, step: Any) -> Any:
+            return builder.gep(base, [builder.add(offset, builder.mul(number, step))])
+
+        rows = [address(data(0), x_at, row(r, 5), x_row) for r in range(n_rows)]
+        panel = builder.gep(data(1), [w_at])
+        sums = [cgutils.alloca_once(builder, vector) for _ in range(n_rows)]
+        for total in sums:
+            builder.store(ir.Constant(vector, [0.0] * COLUMNS), total)
+        undefined = ir.Constant(vector, ir.Undefined)
+        everywhere = ir.Constant(ir.VectorType(lane, COLUMNS), [0] * COLUMNS)
+
+        def accumulate(index: Any) -> None:
+            place = builder.gep(panel, [builder.mul(index, w_step)])
+            weights = builder.load(builder.bitcast(place, vector.as_pointer()), align=4)
+            x_index = builder.mul(index, x_step)
+            for start, total in zip(rows, sums, strict=True):
+                value = builder.insert_element(undefined, builder.load(builder.gep(start, [x_index])), lane(0))
+                broadcast = builder.shuffle_vector(value, undefined, everywhere)
+                builder.store(builder.call(fma, [broadcast, weights, builder.load(total)]), total)
+
+        rounds = builder.udiv(depth, word(UNROLL))
+        with cgutils.for_range(builder, rounds, intp=word) as loop:
+            for step in range(UNROLL):
+                accumulate(builder.add(builder.mul(loop.index, word(UNROLL)), word(step)))
+        done = builder.mul(rounds, word(UNROLL))
+        with cgutils.for_range(builder, builder.sub(depth, done), intp=word) as loop:
+            accumulate(builder.add(done, loop.index))
+        for r, total in enumerate(sums):
+            place = address(data(2), out_at, row(r, 6), out_row)
+            target = builder.bitcast(place, vector.as_pointer())
+            builder.store(builder.fadd(builder.load(target, align=4), builder.load(total)), target, align=4)
+        return context.get_dummy_value()
+
+    geometry_type = types.UniTuple(types.intp, 8)
 
     @intrinsic
-    def tile(
-        typingctx: Any,
-        x: Any,
-        w: Any,
-        out: Any,
-        w_at: Any,
-        depth: Any,
-        x_step: Any,
-        w_step: Any,
-        x_at: Any,
-        out_at: Any,
+    def gathered_tile(
+        typingctx: Any, x: Any, w: Any, out: Any, geometry: Any, begin: Any, in_rows: Any, out_rows: Any
     ) -> Any:
-        rows_at = types.UniTuple(types.intp, n_rows)
-        signature = types.void(x, w, out, *[types.intp] * 4, rows_at, rows_at)
+        return types.void(x, w, out, geometry_type, types.intp, in_rows, out_rows), codegen
 
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            single = ir.FloatType()
-            vector = ir.VectorType(single, COLUMNS)
-            word = ir.IntType(64)
+    @intrinsic
+    def tile(typingctx: Any, x: Any, w: Any, out: Any, geometry: Any, begin: Any) -> Any:
+        return types.void(x, w, out, geometry_type, types.intp), codegen
 
-            def data(position: int) -> Any:
-                return context.make_array(sig.args[position])(context, builder, args[position]).data
-
-            def load_vector(pointer: Any) -> Any:
-                return builder.load(builder.bitcast(pointer, vector.as_pointer()), align=4)
-
-            fma = cgutils.get_or_insert_function(
-                builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{COLUMNS}f32"
-            )
-            rows = [builder.gep(data(0), [builder.extract_value(args[7], r)]) for r in range(n_rows)]
-            panel = builder.gep(data(1), [args[3]])
-            sums = [cgutils.alloca_once(builder, vector) for _ in range(n_rows)]
-            zero = ir.Constant(vector, [0.0] * COLUMNS)
-            for total in sums:
-                builder.store(zero, total)
-            undefined = ir.Constant(vector, ir.Undefined)
-            lanes = ir.Constant(ir.VectorType(ir.IntType(32), COLUMNS), [0] * COLUMNS)
-
-            def accumulate(index: Any) -> None:
-                weights = load_vector(builder.gep(panel, [builder.mul(index, args[6])]))
-                x_index = builder.mul(index, args[5])
-                for row, total in zip(rows, sums, strict=True):
-                    value = builder.load(builder.gep(row, [x_index]))
-                    first = builder.insert_element(undefined, value, ir.IntType(32)(0))
-                    broadcast = builder.shuffle_vector(first, undefined, lanes)
-                    builder.store(builder.call(fma, [broadcast, weights, builder.load(total)]), total)
-
-            unrolled = builder.udiv(args[4], word(UNROLL))
-            with cgutils.for_range(builder, unrolled, intp=word) as loop:
-                start = builder.mul(loop.index, word(UNROLL))
-                for step in range(UNROLL):
-                    accumulate(builder.add(start, word(step)))
-            done = builder.mul(unrolled, word(UNROLL))
-            with cgutils.for_range(builder, builder.sub(args[4], done), intp=word) as loop:
-                accumulate(builder.add(done, loop.index))
-            for r, total in enumerate(sums):
-                target = builder.bitcast(builder.gep(data(2), [builder.extract_value(args[8], r)]), vector.as_pointer())
-                builder.store(builder.fadd(builder.load(target, align=4), builder.load(total)), target, align=4)
-            return context.get_dummy_value()
-
-        return signature, codegen
-
-    return tile
+    return gathered_tile if gathered else tile
 
 
-_tile6, _tile4, _tile2, _tile1 = (_make_tile(n) for n in (6, 4, 2, 1))
+_tile6, _tile2, _tile1 = (_make_tile(n, gathered=False) for n in (6, 2, 1))
+_gathered6, _gathered2, _gathered1 = (_make_tile(n, gathered=True) for n in (6, 2, 1))
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -122,93 +128,23 @@ def gather_product(x: Any, packed: Any, in_rows: Any, out_rows: Any, first: Any,
     """Add `x[i] @ weights[k]` to `out[o]` for the pairs (i, o) of each kernel k.
 
     Kernel k's pairs are (in_rows, out_rows)[first[k]:last[k]]; x (N, Cin) and out (M, Cout) float32, C-contiguous;
-    packed from `pack_weights`; Cout a multiple of 16.
-    Within one kernel an output row must not occur twice.
+    packed from `pack_weights`; Cout a multiple of 16. Within one kernel an output row must not occur twice.
     """
     kernels, panels, depth, _ = packed.shape
     x_flat, w_flat, out_flat = x.ravel(), packed.ravel(), out.ravel()
-    x_step, out_step = x.shape[1], out.shape[1]
     for k in range(kernels):
         for panel in range(panels):
             w_at = (k * panels + panel) * depth * COLUMNS
-            shift = panel * COLUMNS
-            p = first[k]
-            end = last[k]
+            geometry = (w_at, depth, 0, x.shape[1], 1, COLUMNS, panel * COLUMNS, out.shape[1])
+            p, end = first[k], last[k]
             while p + 6 <= end:
-                _tile6(
-                    x_flat,
-                    w_flat,
-                    out_flat,
-                    w_at,
-                    depth,
-                    1,
-                    COLUMNS,
-                    (
-                        np.intp(in_rows[p]) * x_step,
-                        np.intp(in_rows[p + 1]) * x_step,
-                        np.intp(in_rows[p + 2]) * x_step,
-                        np.intp(in_rows[p + 3]) * x_step,
-                        np.intp(in_rows[p + 4]) * x_step,
-                        np.intp(in_rows[p + 5]) * x_step,
-                    ),
-                    (
-                        np.intp(out_rows[p]) * out_step + shift,
-                        np.intp(out_rows[p + 1]) * out_step + shift,
-                        np.intp(out_rows[p + 2]) * out_step + shift,
-                        np.intp(out_rows[p + 3]) * out_step + shift,
-                        np.intp(out_rows[p + 4]) * out_step + shift,
-                        np.intp(out_rows[p + 5]) * out_step + shift,
-                    ),
-                )
+                _gathered6(x_flat, w_flat, out_flat, geometry, p, in_rows, out_rows)
                 p += 6
-            if p + 4 <= end:
-                _tile4(
-                    x_flat,
-                    w_flat,
-                    out_flat,
-                    w_at,
-                    depth,
-                    1,
-                    COLUMNS,
-                    (
-                        np.intp(in_rows[p]) * x_step,
-                        np.intp(in_rows[p + 1]) * x_step,
-                        np.intp(in_rows[p + 2]) * x_step,
-                        np.intp(in_rows[p + 3]) * x_step,
-                    ),
-                    (
-                        np.intp(out_rows[p]) * out_step + shift,
-                        np.intp(out_rows[p + 1]) * out_step + shift,
-                        np.intp(out_rows[p + 2]) * out_step + shift,
-                        np.intp(out_rows[p + 3]) * out_step + shift,
-                    ),
-                )
-                p += 4
-            if p + 2 <= end:
-                _tile2(
-                    x_flat,
-                    w_flat,
-                    out_flat,
-                    w_at,
-                    depth,
-                    1,
-                    COLUMNS,
-                    (np.intp(in_rows[p]) * x_step, np.intp(in_rows[p + 1]) * x_step),
-                    (np.intp(out_rows[p]) * out_step + shift, np.intp(out_rows[p + 1]) * out_step + shift),
-                )
+            while p + 2 <= end:
+                _gathered2(x_flat, w_flat, out_flat, geometry, p, in_rows, out_rows)
                 p += 2
             if p < end:
-                _tile1(
-                    x_flat,
-                    w_flat,
-                    out_flat,
-                    w_at,
-                    depth,
-                    1,
-                    COLUMNS,
-                    (np.intp(in_rows[p]) * x_step,),
-                    (np.intp(out_rows[p]) * out_step + shift,),
-                )
+                _gathered1(x_flat, w_flat, out_flat, geometry, p, in_rows, out_rows)
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -235,40 +171,16 @@ def strided_product(
     `w_at + p w_panel + d w_step`; row r of out at `out_at + r out_row`. `width` is a multiple of 16.
     """
     for panel in range(width // COLUMNS):
-        w_from = w_at + panel * w_panel
-        shift = out_at + panel * COLUMNS
-        i = begin
-        while i + 6 <= end:
-            a, o = x_at + i * x_row, i * out_row + shift
-            _tile6(
-                x,
-                w,
-                out,
-                w_from,
-                depth,
-                x_step,
-                w_step,
-                (a, a + x_row, a + 2 * x_row, a + 3 * x_row, a + 4 * x_row, a + 5 * x_row),
-                (o, o + out_row, o + 2 * out_row, o + 3 * out_row, o + 4 * out_row, o + 5 * out_row),
-            )
-            i += 6
-        if i + 4 <= end:
-            a, o = x_at + i * x_row, i * out_row + shift
-            _tile4(
-                x,
-                w,
-                out,
-                w_from,
-                depth,
-                x_step,
-                w_step,
-                (a, a + x_row, a + 2 * x_row, a + 3 * x_row),
-                (o, o + out_row, o + 2 * out_row, o + 3 * out_row),
-            )
-            i += 4
-        while i < end:
-            _tile1(x, w, out, w_from, depth, x_step, w_step, (x_at + i * x_row,), (i * out_row + shift,))
-            i += 1
+        geometry = (w_at + panel * w_panel, depth, x_at, x_row, x_step, w_step, out_at + panel * COLUMNS, out_row)
+        row = begin
+        while row + 6 <= end:
+            _tile6(x, w, out, geometry, row)
+            row += 6
+        while row + 2 <= end:
+            _tile2(x, w, out, geometry, row)
+            row += 2
+        if row < end:
+            _tile1(x, w, out, geometry, row)
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
