@@ -21,6 +21,8 @@ _STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, neve
 _STEP_M = 0.25  # and so is a step higher than this
 _BENDING = 0.12  # the ground may fall away from the plane through it by this much a metre of distance
 _CONE_M = 0.4  # and by this much anywhere; what lies deeper is a reflection
+_DROP_M = 0.4  # what lies this far below the ground around it is another storey
+_CEILING = 0.15  # weight of a cell's ceiling beside that of a flat cell, 1
 _FARTHEST_M = 150.0  # no sensor on a robot sees the ground beyond
 _LEVELS = 3  # the membrane is stretched over cells of 8, 4 and 2 m
 _SWEEPS = 12
@@ -33,9 +35,10 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
     above it. The ground is modelled out to `reach_m` on either side and carried on beyond. NaN points get NaN.
 
     The ground is a plane through what looks like ground, plus a membrane that follows the rings where they touch it
-    and comes back to the plane where they do not. What looks like ground: the lowest point of a cell, no higher above
-    any other cell than the steepest road would lead. Every point, and every ray on its way to one, bounds the ground
-    from above; that keeps walls and car roofs out. With no usable point the ground is the plane z = 0.
+    and comes back to the plane where they do not. What looks like ground: the lowest points of flat cells, no higher
+    above any other cell than the steepest road would lead, which keeps walls and car roofs out, and not far below the
+    ground around, as canals and boats are. Every ray passes above the ground on its way to its point. With no usable
+    point the ground is the plane z = 0.
     """
     check_points(points_base, "points_base")
     if not (math.isfinite(sensor_height_m) and math.isfinite(reach_m) and reach_m > 0):
@@ -50,53 +53,57 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
 
 @njit(cache=True, nogil=True)
 def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int) -> Float32Array:
-    """Run the steps: cells, bound, plane; once more along that plane; membrane; heights."""
+    """Run the steps: cells and plane; once more along that plane; ceiling, membrane, heights."""
     plane = np.zeros(3)
     deepest = np.float32(_STEEPEST)  # before the slope is known
     for _ in range(2):
         # The second time "lowest" and "flat" are meant along the slope that the first time found.
-        lowest, where, share = _lowest_of_cells(points, cells, plane, deepest)
+        lowest, where, flat = _lowest_of_cells(points, cells, plane, deepest)
         deepest = np.float32(_BENDING)
-        bound = _steepest_bound(lowest)
-        _bound_by_rays(bound, lowest, where, sensor_height)
-        weight = np.zeros((cells, cells), np.float32)
-        for row in range(cells):
-            for column in range(cells):
-                if lowest[row, column] <= bound[row, column] + np.float32(_STEP_M):
-                    weight[row, column] = share[row, column] * share[row, column]
-        plane = _fit_plane(where, lowest, weight, plane)
+        plane = _fit_plane(where, lowest, _below(lowest, _steepest_bound(lowest), flat), plane)
 
     # From here on everything is measured from the plane.
+    ceiling = _seen_through(lowest, where, sensor_height)
     target = np.zeros((cells, cells), np.float32)
-    ceiling = np.full((cells, cells), np.inf, np.float32)
     half = cells * _CELL_M / 2
     for row in range(cells):
         for column in range(cells):
-            x, y = where[row, column, 0], where[row, column, 1]
-            if np.isfinite(lowest[row, column]):
+            if lowest[row, column] < np.inf:
+                x, y = where[row, column, 0], where[row, column, 1]
                 target[row, column] = lowest[row, column] - (plane[0] * x + plane[1] * y + plane[2])
             x, y = (column + 0.5) * _CELL_M - half, (row + 0.5) * _CELL_M - half
-            ceiling[row, column] = bound[row, column] + 0.1 - (plane[0] * x + plane[1] * y + plane[2])
+            ceiling[row, column] -= plane[0] * x + plane[1] * y + plane[2]
     ground = np.zeros((cells, cells), np.float32)
-    robust = weight.copy()
-    for scale in (1.0, 0.5, 0.25):
-        _stretch(ground, target, robust, ceiling)
-        for row in range(cells):
-            for column in range(cells):
-                if weight[row, column] > 0:
-                    above = (target[row, column] - ground[row, column]) / np.float32(scale)
-                    robust[row, column] = weight[row, column] / (np.float32(1.0) + above * above)
-    _stretch(ground, target, robust, ceiling)
+    _stretch(ground, target, flat, ceiling, 1.0)
+    # What lies well below the ground so far (a canal's wall, a boat, a cellar) says nothing about the road above it.
+    for row in range(cells):
+        for column in range(cells):
+            if target[row, column] < ground[row, column] - np.float32(_DROP_M):
+                lowest[row, column] = np.inf
+    weight = _below(lowest, _steepest_bound(lowest), flat)
+    for scale in (2.0, 1.0, 0.5, 0.25):
+        _stretch(ground, target, weight, ceiling, scale)
     heights: Float32Array = _heights_above(points, plane, ground)
     return heights
+
+
+@njit(cache=True, nogil=True)
+def _below(lowest: Float32Array, bound: Float32Array, flat: Float32Array) -> Float32Array:
+    """Return the weight of each cell as ground: its flatness, nothing where it rises above the bound."""
+    weight = np.zeros_like(flat)
+    for row in range(flat.shape[0]):
+        for column in range(flat.shape[0]):
+            if lowest[row, column] <= bound[row, column] + np.float32(_STEP_M):
+                weight[row, column] = flat[row, column]
+    return weight
 
 
 @njit(cache=True, nogil=True)
 def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array, deepest: float):  # type: ignore[no-untyped-def]
     """Return each cell's lowest z (infinite where there is none to trust), its x and y, and how flat the cell is.
 
-    Lowest is the point that lies lowest over the plane. Flat is the share of the points up to 2 m above it that lie
-    within 0.3 m of it: 1 on a road, little where a wall stands. A lowest point without a second one near it, or far
+    Lowest is the point that lies lowest over the plane. Flat is the cubed share of the points up to 2 m above it that
+    lie within 0.3 m of it: 1 on a road, little where a wall stands. A lowest point without a second one near it, or far
     below all cells around, is a reflection.
     """
     inverse = np.float32(1.0 / _CELL_M)
@@ -135,15 +142,15 @@ def _lowest_of_cells(points: Float32Array, cells: int, plane: Float64Array, deep
                 near[row, column] += 1
                 if above < np.float32(0.3):
                     low[row, column] += 1
-    share = np.zeros((cells, cells), np.float32)
+    flat = np.zeros((cells, cells), np.float32)
     trusted = np.full((cells, cells), np.inf, np.float32)
     for row in range(cells):
         for column in range(cells):
             if low[row, column] >= 2 and not _is_pit_of_scan(lowest, row, column):
-                share[row, column] = low[row, column] / near[row, column]
+                flat[row, column] = (low[row, column] / near[row, column]) ** 3
                 x, y = where[row, column, 0], where[row, column, 1]
                 trusted[row, column] = lowest[row, column] + (a * x + b * y + c)
-    return trusted, where, share
+    return trusted, where, flat
 
 
 @njit(cache=True, nogil=True)
@@ -198,11 +205,12 @@ def _steepest_bound(lowest: Float32Array) -> Float32Array:
 
 
 @njit(cache=True, nogil=True)
-def _bound_by_rays(bound: Float32Array, lowest: Float32Array, where: Float32Array, sensor_height: float) -> None:
-    """Lower the bound to the ray from the sensor to each cell's lowest point: light does not pass through ground."""
+def _seen_through(lowest: Float32Array, where: Float32Array, sensor_height: float) -> Float32Array:
+    """Return the lowest ray over each cell, from the sensor to the cells' lowest points: it passes above the ground."""
     n = lowest.shape[0]
     half = np.float32(n * _CELL_M / 2)
     inverse = np.float32(1.0 / _CELL_M)
+    ceiling = lowest.copy()
     for row in range(n):
         for column in range(n):
             z = lowest[row, column]
@@ -221,15 +229,16 @@ def _bound_by_rays(bound: Float32Array, lowest: Float32Array, where: Float32Arra
                 v += dv
                 height += dz
                 r, c = int(v), int(u)
-                bound[r, c] = min(bound[r, c], height)
+                ceiling[r, c] = min(ceiling[r, c], height)
+    return ceiling
 
 
 @njit(cache=True, nogil=True)
 def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, plane: Float64Array) -> Float64Array:
     """Return the plane z = a x + b y + c through the cells' lowest points, held by the base that stands at z = 0.
 
-    Cells off the last plane count less (Cauchy), those above it least: what stands on the ground is above it. Cells
-    near the robot count more, there the rings are dense.
+    Cells off the last plane count less (Cauchy), in ever narrower bounds. Cells near the robot count more: there the
+    rings are dense.
     """
     n = lowest.shape[0]
     count = 0
@@ -242,13 +251,13 @@ def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, 
                 w[count] = weight[row, column] / (1.0 + (x[count] ** 2 + y[count] ** 2) / 400.0)
                 count += 1
     pa, pb, pc = plane
-    for _ in range(8):
-        xx, yy = 40.0, 40.0  # flat unless the rings say otherwise
+    for scale in (2.0, 2.0, 2.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25):
+        xx, yy = 4.0, 4.0  # flat unless the rings say otherwise
         n1 = 20.0
         xy, x1, y1, xz, yz, z1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(count):
             off = z[i] - (pa * x[i] + pb * y[i] + pc)
-            scaled = off / (0.15 if off > 0 else 0.4)
+            scaled = off / scale
             v = w[i] / (1.0 + scaled * scaled)
             xx += v * x[i] * x[i]
             xy += v * x[i] * y[i]
@@ -270,28 +279,45 @@ def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, 
 
 
 @njit(cache=True, nogil=True)
-def _stretch(ground: Float32Array, target: Float32Array, weight: Float32Array, ceiling: Float32Array) -> None:
-    """Relax `ground` between the weighted targets, under the ceiling, with a faint pull to 0; coarse to fine."""
+def _stretch(
+    ground: Float32Array, target: Float32Array, weight: Float32Array, ceiling: Float32Array, scale: float
+) -> None:
+    """Relax `ground` towards the weighted targets, softly under the ceiling, faintly towards 0; coarse to fine.
+
+    Targets farther than `scale` from where the ground is now count less (Cauchy).
+    """
     n = ground.shape[0]
+    w = np.zeros((n, n), np.float32)
+    t = np.zeros((n, n), np.float32)
+    inverse_scale = np.float32(1.0 / scale)
+    for row in range(n):
+        for column in range(n):
+            now = ground[row, column]
+            if weight[row, column] > 0:
+                off = (target[row, column] - now) * inverse_scale
+                w[row, column] = weight[row, column] / (np.float32(1.0) + off * off)
+                t[row, column] = w[row, column] * target[row, column]
+            over = now - ceiling[row, column]
+            if over > np.float32(0.1):
+                w[row, column] += np.float32(_CEILING)
+                t[row, column] += np.float32(_CEILING) * ceiling[row, column]
     for level in range(_LEVELS - 1, -1, -1):
         step = 1 << level
         m = n // step
         held = np.zeros((m, m), np.float32)
         inverse = np.zeros((m, m), np.float32)
-        top = np.full((m, m), np.inf, np.float32)
         g = np.zeros((m + 2, m + 2), np.float32)  # with a rim that repeats the outermost cells: free edges
         for row in range(n):
             for column in range(n):
                 R, C = row // step, column // step
-                inverse[R, C] += weight[row, column]
-                held[R, C] += weight[row, column] * target[row, column]
-                top[R, C] = min(top[R, C], ceiling[row, column])
+                inverse[R, C] += w[row, column]
+                held[R, C] += t[row, column]
                 g[R + 1, C + 1] += ground[row, column]
-        pull = np.float32(4.0 + 0.002 * step * step)
+        others = np.float32(4.0 + 0.0005 * step * step)
         mean = np.float32(1.0 / (step * step))
         for R in range(m):
             for C in range(m):
-                inverse[R, C] = np.float32(1.0) / (inverse[R, C] + pull)
+                inverse[R, C] = np.float32(1.0) / (inverse[R, C] + others)
                 g[R + 1, C + 1] *= mean
         for _ in range(_SWEEPS):
             for k in range(1, m + 1):
@@ -299,8 +325,8 @@ def _stretch(ground: Float32Array, target: Float32Array, weight: Float32Array, c
             for R in range(1, m + 1):
                 left = g[R, 0]
                 for C in range(1, m + 1):
-                    others = held[R - 1, C - 1] + g[R - 1, C] + g[R + 1, C] + g[R, C + 1]
-                    left = min((others + left) * inverse[R - 1, C - 1], top[R - 1, C - 1])
+                    around = held[R - 1, C - 1] + g[R - 1, C] + g[R + 1, C] + g[R, C + 1]
+                    left = (around + left) * inverse[R - 1, C - 1]
                     g[R, C] = left
         for row in range(n):
             for column in range(n):
