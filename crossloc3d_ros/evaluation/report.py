@@ -121,7 +121,8 @@ def _tiles(table: EstimateTable, scores: Scores | None) -> str:
     tiles = [("Fixes given", _percent(fixes / max(len(table), 1)), f"{fixes:,} of {len(table):,} scans")]
     if scores is not None:
         error, first = scores.fix_error, scores.best_candidate_error
-        tiles.append(("Median error of a fix", _metres(error.median_m), f"95 % within {_metres(error.p95_m)}"))
+        if error.count:
+            tiles.append(("Median error of a fix", _metres(error.median_m), f"95 % within {_metres(error.p95_m)}"))
         tiles.append(
             ("First candidate, median", _metres(first.median_m), "over all scans, also those that gave no fix")
         )
