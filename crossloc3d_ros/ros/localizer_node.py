@@ -41,7 +41,7 @@ from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.localization.gravity import GravityFilter
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.places.store import AerialMap, read_manifest
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,
     candidates_message,
@@ -71,7 +71,7 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     """Load weights and map and bring them together; raises CrossLocError saying what is missing."""
     if not config.map:
         raise ConfigError("parameter 'map' is empty: give the folder of an aerial map, as build_map writes it")
-    # Late, because torch takes seconds: wrong parameters are refused and the node is on the graph before.
+    read_manifest(Path(config.map))  # a wrong folder is told before the seconds that it takes to load torch
     from crossloc3d_ros.encoder.checkpoint import load_encoder
 
     weights = Path(config.weights) if config.weights else None

@@ -407,7 +407,7 @@ def truncated_map(folder: Path, world: World) -> Path:
         ({"map": '""'}, "parameter 'map' is empty"),
         ({"weights": "OTHER"}, "was made by other weights"),
         ({"map": "NOWHERE"}, "does not exist; build one with"),
-        ({"map": "TRUNCATED"}, "is truncated"),
+        pytest.param({"map": "TRUNCATED"}, "is truncated", marks=pytest.mark.slow),
         ({"--params-file": "UNKNOWN"}, "unknown parameter 'scan.mounting.height_m'"),
         ({"--params-file": "BROKEN"}, "broken.yaml"),
         pytest.param({"scan.mounting.z_m": "high"}, "'scan.mounting.z_m' must be of type", marks=pytest.mark.slow),
