@@ -279,6 +279,11 @@ class Robot:
     origins: list[NavSatFix] = field(default_factory=list)
     diagnostics: list[DiagnosticArray] = field(default_factory=list)
 
+    def forget(self) -> None:
+        """Drop what has come so far, but for what is latched."""
+        for kept in (self.fixes, self.candidates, self.tables, self.markers, self.diagnostics):
+            kept.clear()
+
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 15.0, what: str = "") -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():
@@ -351,7 +356,7 @@ def robot_context(ros_environment: dict[str, str], domain: int) -> Iterator[rclp
     context.try_shutdown()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def robot(robot_context: rclpy.Context) -> Iterator[Robot]:
     node = rclpy.create_node("robot", context=robot_context)
     executor = SingleThreadedExecutor(context=robot_context)

@@ -52,6 +52,7 @@ def localizer(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
 @pytest.fixture
 def active(localizer: NodeProcess, robot: Robot) -> Robot:
     robot.wait_for_localizer()
+    robot.forget()
     return robot
 
 
