@@ -48,7 +48,7 @@ _SHOWN_EVERY_S = 5.0
 class DemoDrive:
     """The drive: long enough for some twenty different places, short enough to be watched."""
 
-    length_m: float = 450.0
+    length_m: float = 600.0
     speed_m_s: float = 5.0
     clearance_m: float = 1.5
     seed: int = 3
