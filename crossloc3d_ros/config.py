@@ -95,7 +95,7 @@ class CredibilityConfig:
     none_distance: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
     none_scale: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
     cluster_radius_m: float = option(50.0, "candidates this near to each other mean one place", low=1.0, high=1000.0)
-    min_probability: float = option(0.5, "a fix needs this belief in one place", low=0.0, high=1.0)
+    min_probability: float = option(0.7, "a fix needs this belief in one place", low=0.0, high=1.0)
     position_floor_m: float = option(25.0, "least standard deviation east and north", low=0.1, high=1000.0)
     height_floor_m: float = option(3.0, "least standard deviation of the height", low=0.1, high=1000.0)
 
@@ -132,7 +132,7 @@ class BuildConfig:
     spacing_m: float = option(19.0, "distance between the centres of neighbouring submaps", low=1.0, high=1000.0)
     cell_m: float = option(1.0, "cell of terrain and surface rasters", low=0.1, high=10.0)
     tile_m: float = option(380.0, "side of the tiles in which the area is worked through", low=50.0, high=5000.0)
-    min_coverage: float = option(0.25, "share of a submap that must have been flown over", low=0.0, high=1.0)
+    min_coverage: float = option(0.75, "share of a submap that must have been flown over", low=0.0, high=1.0)
     chunk_points: int = option(1_000_000, "points read from a file at once", low=1000, high=100_000_000)
     workers: int = option(1, "processes on this machine", low=1, high=256)
 
