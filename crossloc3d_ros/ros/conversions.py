@@ -130,11 +130,13 @@ def markers_message(estimate: Estimate, enu: Float64Array, global_frame_id: str)
         ellipse.pose.orientation = Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2.0), w=math.cos(yaw / 2.0))
         ellipse.scale = Vector3(x=4.0 * math.sqrt(variances[1]), y=4.0 * math.sqrt(variances[0]), z=1.0)
         ellipse.color = _color(0.1, 0.8, 0.2, 0.4) if is_fix else _color(0.8, 0.1, 0.1, 0.25)
-        text = _marker(header, "reason", 0, Marker.TEXT_VIEW_FACING, _above(estimate.enu, 40.0))
-        text.scale.z = 8.0
-        text.color = _color(1.0, 1.0, 1.0, 1.0)
-        text.text = estimate.reason
-        markers += [ellipse, text]
+        markers.append(ellipse)
+    # Where nothing is known, the reason stands at the map's origin.
+    text = _marker(header, "reason", 0, Marker.TEXT_VIEW_FACING, _above(np.nan_to_num(estimate.enu), 40.0))
+    text.scale.z = 8.0
+    text.color = _color(1.0, 1.0, 1.0, 1.0)
+    text.text = estimate.reason
+    markers.append(text)
     return MarkerArray(markers=markers)
 
 

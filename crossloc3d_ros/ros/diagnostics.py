@@ -17,6 +17,8 @@ from crossloc3d_ros.types import Estimate, FixStatus
 WINDOW = 300
 """Latencies are those of so many last scans: half a minute at 10 Hz."""
 SILENCE_S = 3.0
+LOST_SHARE, LOST_TOLERATED = 0.05, 10
+"""More lost than this is no hiccup: the clouds do not fit into the publisher's shared memory, or the network is slow."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,11 @@ def judge_health(snapshot: Snapshot, topic: str, publishers: int, complaint: str
         return DiagnosticStatus.ERROR, snapshot.last.estimate.reason
     if snapshot.last.estimate.status is FixStatus.NO_FIX:
         return DiagnosticStatus.WARN, snapshot.last.estimate.reason
+    if snapshot.lost > LOST_TOLERATED and snapshot.lost > LOST_SHARE * (snapshot.lost + snapshot.received):
+        return DiagnosticStatus.WARN, (
+            f"{snapshot.lost} of {snapshot.lost + snapshot.received} clouds on {topic} were lost in transport: give "
+            "the publishing process a Fast DDS profile with more shared memory, or make both sides reliable"
+        )
     return DiagnosticStatus.OK, snapshot.last.estimate.reason
 
 

@@ -19,7 +19,7 @@ import rclpy
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus, PointCloud2
 from std_srvs.srv import Empty
@@ -365,6 +365,10 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
     for _ in range(100):
         next(robot.stamps_ns)  # ten seconds: the sample is too old then to say anything
     assert with_imu < 0.7 * best_distance(None)
+
+    # A driver that is best effort never reaches a reliable subscription, and the node says so.
+    robot.node.create_publisher(PointCloud2, "/rover/lidar", qos_profile_sensor_data)
+    managed.wait_for_output("a publisher on /rover/lidar offers an incompatible RELIABILITY", 15.0)
 
     now = Clock()
     now.clock.sec = 4321

@@ -10,6 +10,7 @@ import time
 import types
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from crossloc3d_ros.ros.diagnostics import Outcome, Statistics, judge_health
 from crossloc3d_ros.ros.newest import NewestWorker
 from crossloc3d_ros.ros.shared_memory import PROFILES_VARIABLE, SEGMENT_BYTES, prepare_for_large_clouds
 from crossloc3d_ros.ros.transforms import TransformSource
+from crossloc3d_ros.types import FixStatus
 
 # The worker
 
@@ -166,6 +168,19 @@ def test_silence_is_explained(
     told, message = judge_health(statistics.snapshot(), "/points", publishers, complaint)
     assert told == level
     assert words in message
+
+
+@pytest.mark.parametrize(("lost", "level"), [(5, DiagnosticStatus.OK), (40, DiagnosticStatus.WARN)])
+def test_clouds_that_get_lost_are_told_even_with_a_fix(lost: int, level: bytes) -> None:
+    statistics = Statistics()
+    estimate = replace(no_estimate(0, "9 of 25 candidates lie at one place"), status=FixStatus.FIX)
+    for _ in range(60):
+        statistics.received()
+    statistics.processed(Outcome(estimate, is_fault=False), latency_ms=20.0)
+    statistics.lost(lost)
+    told, message = judge_health(statistics.snapshot(), "/points", 1, "")
+    assert told == level
+    assert (f"{lost} of {60 + lost} clouds on /points were lost" in message) == (level == DiagnosticStatus.WARN)
 
 
 def test_latencies_are_those_of_the_last_scans() -> None:
