@@ -18,7 +18,7 @@ WINDOW = 300
 """Latencies are those of so many last scans: half a minute at 10 Hz."""
 SILENCE_S = 3.0
 LOST_SHARE, LOST_TOLERATED = 0.05, 10
-"""More lost than this is no hiccup: the clouds do not fit into the publisher's shared memory, or the network is slow."""
+"""More lost than this is no hiccup: clouds do not fit into the publisher's shared memory, or the network is slow."""
 
 
 @dataclass(frozen=True)
