@@ -193,8 +193,8 @@ def _words(evaluation: Evaluation, aerial_map: AerialMap, about: About) -> str:
             f"of the robot. The map measures {width_m:,.0f} × {height_m:,.0f} m, so guessing already succeeds now and "
             "then: always compare with the tick. On a larger map the same encoder will score lower, because more "
             "places look alike; figures from maps of different size cannot be compared. Candidates crowd together, "
-            "because neighbouring squares look alike, while lots fall everywhere: at high ranks and wide radii drawing by "
-            "lot may come out ahead of a localizer that is far better at naming one place. "
+            "because neighbouring squares look alike, while lots fall everywhere: at high ranks and wide radii drawing "
+            "by lot may come out ahead of a localizer that is far better at naming one place. "
             + (
                 f"For {_percent(1.0 - scores.reachable)} of the scans the map has no square within "
                 f"{max(RADII_M):g} m at all, and no method could have found one."
