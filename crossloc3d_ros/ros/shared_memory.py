@@ -79,11 +79,12 @@ def write_profile(path: Path) -> Path:
 def _profile_folder(variables: MutableMapping[str, str]) -> Path:
     """Return a folder of this user's that can be written: the cache, or a temporary one on a robot without home."""
     home = variables.get("XDG_CACHE_HOME") or str(Path(variables.get("HOME") or "/nonexistent") / ".cache")
-    cache = Path(home) / "crossloc3d_ros"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        if os.access(cache, os.W_OK):
-            return cache
-    except OSError:
-        pass
+    for folder in (Path(home) / "crossloc3d_ros", Path(tempfile.gettempdir()) / f"crossloc3d_ros_{os.getuid()}"):
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # A folder of somebody else's under a name that can be guessed is not to be trusted.
+            if folder.stat().st_uid == os.getuid() and os.access(folder, os.W_OK):
+                return folder
+        except OSError:
+            continue
     return Path(tempfile.mkdtemp(prefix="crossloc3d_ros_"))

@@ -139,12 +139,14 @@ def test_what_the_user_has_chosen_is_left_alone(own: dict[str, str], tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     occupied = tmp_path / "file"
     occupied.write_text("")
-    path = prepare_for_large_clouds({"XDG_CACHE_HOME": str(occupied)})
-    assert path is not None
-    assert path.is_file()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    paths = [prepare_for_large_clouds({"XDG_CACHE_HOME": str(occupied)}) for _ in range(2)]
+    assert paths[0] is not None
+    assert paths[0].is_file()
+    assert paths[0] == paths[1], "not a new folder for every process"
 
 
 # Diagnostics
