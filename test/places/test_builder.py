@@ -56,7 +56,8 @@ def test_the_map_holds_the_submaps_of_the_survey(
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     inside = submap_centres((low[0] + 1, low[1] + 1, high[0] - 1, high[1] - 1), 19.0)
     # A place up to 5 m from a point counts as flown over.
-    covered = (np.minimum(inside + 50, high + 5) - np.maximum(inside - 50, low - 5)).prod(axis=1) / 100.0**2
+    half = encoder.preprocessing.half_extent_m
+    covered = (np.minimum(inside + half, high + 5) - np.maximum(inside - half, low - 5)).prod(axis=1) / (2 * half) ** 2
     have = {(e, n) for e, n, _ in aerial.submaps.grid}
     assert {(e, n) for e, n in inside[covered > 0.78]} <= have
     assert not {(e, n) for e, n in inside[covered < 0.7]} & have
