@@ -409,7 +409,7 @@ def truncated_map(folder: Path, world: World) -> Path:
         ({"scan.min_rang_m": 2.0}, "unknown parameter 'scan.min_rang_m': did you mean 'scan.min_range_m'?"),
         ({"top_k": 0}, "'top_k' must lie between 1 and 1000"),
         pytest.param(
-            {"qos_overrides./lidar.subscription.depth": 3}, "can be overridden for /points, /imu", marks=pytest.mark.slow
+            {"qos_overrides./lidar.subscription.depth": 3}, "overridden for /points, /imu", marks=pytest.mark.slow
         ),
         pytest.param({"map": '""'}, "parameter 'map' is empty", marks=pytest.mark.slow),
         ({"weights": "OTHER"}, "was made by other weights"),
