@@ -73,9 +73,20 @@ class ScanConfig:
 
     min_range_m: float = option(1.0, "nearer points are left out", low=0.0, high=100.0)
     max_range_m: float = option(100.0, "farther points are left out", low=1.0, high=1000.0)
-    body_min_m: tuple[float, float, float] = option((-0.6, -0.5, -0.5), "lower corner of the own body, base frame")
-    body_max_m: tuple[float, float, float] = option((0.6, 0.5, 2.0), "upper corner; equal = no body")
+    body_min_m: tuple[float, float, float] = option(
+        (-0.6, -0.5, -0.5), "lower corner of the body, base frame", low=-50.0, high=50.0
+    )
+    body_max_m: tuple[float, float, float] = option(
+        (0.6, 0.5, 2.0), "upper corner; equal = no body", low=-50.0, high=50.0
+    )
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
+
+    def __post_init__(self) -> None:
+        """Refuse what no point could pass."""
+        if self.min_range_m >= self.max_range_m:
+            raise ConfigError(f"'min_range_m' ({self.min_range_m}) must be below 'max_range_m' ({self.max_range_m})")
+        if any(low > high for low, high in zip(self.body_min_m, self.body_max_m, strict=True)):
+            raise ConfigError(f"'body_min_m' {self.body_min_m} must not exceed 'body_max_m' {self.body_max_m}")
 
 
 @dataclass(frozen=True)

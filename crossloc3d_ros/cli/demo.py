@@ -31,7 +31,7 @@ from crossloc3d_ros.evaluation.report import About
 from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.places.builder import build_map
-from crossloc3d_ros.places.store import AerialMap, read_manifest, sha256
+from crossloc3d_ros.places.store import AerialMap, sha256
 from crossloc3d_ros.simulation.drive import DriveConfig, drive
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
@@ -159,10 +159,17 @@ def make_map(survey: Path, folder: Path, weights: Path | None, fingerprint: str,
         "encoder": fingerprint,
         "config": asdict(config),
         "geoid_separation_m": GEOID_SEPARATION_M,
+        "software": own_version(),
     }
-    if folder.is_dir() and _is_made_from(stamp, made_from) and read_manifest(folder) is not None:
-        target.print("current, not built again (--fresh does)")
-        return
+    if folder.is_dir() and _is_made_from(stamp, made_from):
+        try:
+            AerialMap.load(folder, fingerprint)
+        except MapError as error:
+            target.print(f"built again: {error}")
+            shutil.rmtree(folder)
+        else:
+            target.print("current, not built again (--fresh does)")
+            return
     folder.parent.mkdir(parents=True, exist_ok=True)
     with ProgressDisplay(target) as display:
         build_map(
@@ -234,7 +241,7 @@ def beside_the_truth(table: EstimateTable, frame: MapFrame) -> Table:
 def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int, answers: int) -> About:
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     dropped = scans - answers
-    unanswered = [f"{dropped:,} scans got no answer because the machine was too slow; they count as misses."]
+    unanswered = [f"{dropped:,} scans got no answer (dropped or lost on the way); they count as misses."]
     return About(
         title="A robot in Amsterdam, told where it is",
         facts={

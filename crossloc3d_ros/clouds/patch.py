@@ -155,6 +155,8 @@ def patch_of_cropped(
         return None
     if origin != "given" or config.vertical_origin == "centre":
         cropped = _recentred(cropped, half_extent_m, config, origin)
+        if len(cropped) < config.min_points:
+            return None
     chosen, available = choose_points(cropped, config.n_points, config.thin_m, config.seed)
     return Patch(chosen / np.float32(half_extent_m), half_extent_m, available)
 

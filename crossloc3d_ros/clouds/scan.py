@@ -59,7 +59,7 @@ def prepare_scan(
     place = points_level - np.array([sensor_level[0], sensor_level[1], 0.0], np.float32)
     half_extent_m = preprocessing.scan_half_extent_m
     reach_m = min(1.45 * half_extent_m, config.max_range_m)  # as far as the patch's corners
-    place[:, 2] = scan_heights(points_level, float(sensor_level[2]), reach_m=reach_m)
+    place[:, 2] = scan_heights(place, float(sensor_level[2]), reach_m=reach_m)
 
     cropped = crop_above_ground(place, half_extent_m, preprocessing)
     counts = ScanCounts(

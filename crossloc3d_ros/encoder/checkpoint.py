@@ -123,8 +123,13 @@ def load_encoder(path: Path | None = None, device: str = "cpu", threads: int | N
     """Load an encoder that is ready to use.
 
     `path`: a weights file, by default the shipped one. `device`: "cpu" or a torch device such as "cuda".
-    `threads`: CPU threads for one descriptor; by default as many as there are cores, at most four.
+    `threads`: CPU threads for one descriptor; by default as many as there are cores, at most four. Raises
+    CheckpointError for weights and ConfigError for a device that cannot be used.
     """
+    if device.split(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"'device' must be cpu or cuda, got '{device}'")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise ConfigError(f"device '{device}': this machine's torch sees no GPU; use cpu")
     checkpoint = load_checkpoint(SHIPPED_WEIGHTS if path is None else path)
     return Encoder(
         checkpoint.model,

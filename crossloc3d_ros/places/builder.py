@@ -38,6 +38,7 @@ from crossloc3d_ros.places.workers import EncoderLoader, Workers, open_workers
 from crossloc3d_ros.types import DescriptorEncoder
 
 _log = logging.getLogger(__name__)
+_MOST_AREA_A_POINT_M2 = 25.0
 
 _WORK_VERSION = 1
 """Raised when the files of the work folder change: an older half-done build is started anew then."""
@@ -112,6 +113,7 @@ def build_map(
     output = Path(output).absolute()
     _check_config(config)
     loader, encoder = _encoder_and_loader(encoder)
+    _restore(output)
     check_output(output, overwrite)
     headers = read_headers(expand_inputs(inputs), crs)
     source_crs = headers[0].crs
@@ -450,6 +452,13 @@ def _publish(finished: Path, output: Path) -> None:
     shutil.rmtree(replaced, ignore_errors=True)
 
 
+def _restore(output: Path) -> None:
+    """Give a map its name back that lost it because the process was killed just when it was being replaced."""
+    replaced = output.with_name(f".{output.name}.replaced")
+    if replaced.is_dir() and not output.exists():
+        replaced.rename(output)
+
+
 class _Counter:
     """Adds up what the tasks report and passes it on."""
 
@@ -469,7 +478,8 @@ def bytes_needed(headers: Sequence[AerialHeader], config: BuildConfig, descripto
     area_m2 = 0.0
     for header in headers:
         width, height = _extent_m(header)
-        area_m2 += width * height
+        # The box of a header with a stray point, or a broken one, says nothing about the area.
+        area_m2 += min(width * height, _MOST_AREA_A_POINT_M2 * header.point_count)
     rasters = 2 * 4 * area_m2 / config.cell_m**2
     submaps = area_m2 / config.spacing_m**2 * (4 * descriptor_size + store.SUBMAP_DTYPE.itemsize)
     return int(points + 2 * (rasters + submaps))

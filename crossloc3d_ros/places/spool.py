@@ -148,13 +148,11 @@ def read_points(
     for index, (folder, key) in enumerate(sources):
         rows = np.fromfile(folder / _file_name(key), dtype=POINT_DTYPE)
         west, south = key[0] * tile_m, key[1] * tile_m
-        e, n = rows["e"] + west, rows["n"] + south
+        e, n = rows["e"].astype(np.float64) + west, rows["n"].astype(np.float64) + south
         inside: BoolArray = (e >= bounds[0]) & (e < bounds[2]) & (n >= bounds[1]) & (n < bounds[3])
-        e = rows["e"][inside].astype(np.float64) + west
-        n = rows["n"][inside].astype(np.float64) + south
-        points.append(np.column_stack([e, n, rows["z"][inside].astype(np.float64)]))
+        points.append(np.column_stack([e[inside], n[inside], rows["z"][inside].astype(np.float64)]))
         classes.append(rows["classification"][inside])
-        origins.append(np.full(len(e), index, dtype=np.int32))
+        origins.append(np.full(np.count_nonzero(inside), index, dtype=np.int32))
     if not points:
         return np.empty((0, 3)), np.empty(0, np.uint8), np.empty(0, np.int32)
     return np.concatenate(points), np.concatenate(classes), np.concatenate(origins)

@@ -19,6 +19,7 @@ from crossloc3d_ros.types import Estimate, FixStatus, Float64Array
 UNKNOWN_ANGLE_VARIANCE_RAD2 = 1.0e6
 """Retrieval tells where, not which way: so large a variance makes every filter ignore the angle."""
 MARKER_LIFETIME_S = 5.0
+UNKNOWN_HEIGHT_VARIANCE_M2 = 1e6
 
 
 def stamp_message(stamp_ns: int) -> TimeMsg:
@@ -46,7 +47,11 @@ def fix_message(estimate: Estimate, base_frame_id: str) -> NavSatFix:
         position_covariance_type=NavSatFix.COVARIANCE_TYPE_UNKNOWN,
     )
     if is_fix:
-        message.position_covariance = [float(v) for v in estimate.covariance.flat]
+        covariance = estimate.covariance.copy()
+        if math.isnan(estimate.altitude_m):  # whoever overlooks the NaN shall not take the height for known
+            covariance[2, :] = covariance[:, 2] = 0.0
+            covariance[2, 2] = UNKNOWN_HEIGHT_VARIANCE_M2
+        message.position_covariance = [float(v) for v in covariance.flat]
         # Spread of the candidates on a floor, not an error that was measured for this very fix.
         message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_APPROXIMATED
     return message

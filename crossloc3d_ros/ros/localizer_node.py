@@ -128,7 +128,10 @@ class LocalizerNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load weights and map and announce the outputs."""
-        return self._attempt(self._configure)
+        result = self._attempt(self._configure)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._release()
+        return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Warm up, publish the map's origin and begin to listen."""
@@ -138,6 +141,7 @@ class LocalizerNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening and let the scan at work end."""
         self._stop_listening()
+        self._complaint = ""
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -161,7 +165,7 @@ class LocalizerNode(LifecycleNode):
         self.destroy_timer(self._autostart_timer)
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != TransitionCallbackReturn.SUCCESS:
-                self.failure = self._complaint
+                self.failure = self._complaint or "the transition failed"
                 return
 
     def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
@@ -178,8 +182,6 @@ class LocalizerNode(LifecycleNode):
             return TransitionCallbackReturn.SUCCESS
         self.get_logger().error(self._complaint)
         self._stop_listening()
-        if not self._outputs:
-            self._release()
         return TransitionCallbackReturn.FAILURE
 
     def _configure(self) -> None:
