@@ -19,7 +19,7 @@ from crossloc3d_ros.encoder.kernels import COLUMNS, dense_product, kernel_map, p
 from crossloc3d_ros.encoder.model import ConvolutionNorm, CrossLoc3D, Grain, RefinementLayer
 from crossloc3d_ros.types import Float32Array, Int32Array, Int64Array
 
-MIN_ROWS_TO_SHARE = 64
+MIN_ROWS_TO_SHARE = 256
 """Below this many rows a stage is quicker on one thread than handed out."""
 
 
