@@ -27,7 +27,8 @@ _loose = njit(cache=True, nogil=True, boundscheck=False, fastmath={"contract", "
 
 _LOG2_E = np.float32(1.44269504)
 _LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-_LOWEST, _HIGHEST = np.float32(-87.0), np.float32(88.0)
+# Far below what a sum can tell from 0, and far enough above denormal numbers, which are slow.
+_LOWEST, _HIGHEST = np.float32(-60.0), np.float32(88.0)
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 _P0, _P1, _P2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
 _P3, _P4, _P5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
