@@ -42,7 +42,13 @@ def test_what_is_current_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
         output.mkdir(exist_ok=True)
 
     monkeypatch.setattr(demo, "build_map", build_map)
-    monkeypatch.setattr(demo, "read_manifest", lambda folder: object())
+    damaged: list[str] = []
+
+    def load(folder: Path, fingerprint: str) -> None:
+        if damaged:
+            raise MapError(damaged.pop())
+
+    monkeypatch.setattr(demo.AerialMap, "load", load)
     demo.make_map(survey, folder, None, "weights-1", target)
     demo.make_map(survey, folder, None, "weights-1", target)
     assert built == ["one"]
@@ -53,6 +59,9 @@ def test_what_is_current_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "map.made-from.json").write_text("{")
     demo.make_map(survey, folder, None, "weights-2", target)
     assert len(built) == 4
+    damaged.append("the index is cut short")
+    demo.make_map(survey, folder, None, "weights-2", target)
+    assert len(built) == 5
 
 
 def test_an_interrupted_build_is_not_taken_for_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
