@@ -85,3 +85,21 @@ def town_drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
             cloud = bag.velodyne_cloud(int(stamps_ns[i]), "velodyne", xyz, 1.0, 0, 0.0)
             writer.write("/velodyne_points", bag.POINT_CLOUD, int(stamps_ns[i]), cloud)
     return TownDrive(folder / "town.laz", folder / "drive", crs, truth, stamps_ns)
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a tiny network of the real kind: another process can load them, unlike a class of a test."""
+    from crossloc3d_ros.config import ModelConfig, PreprocessingConfig
+    from crossloc3d_ros.encoder.checkpoint import save_checkpoint
+    from crossloc3d_ros.encoder.model import CrossLoc3D
+
+    model = CrossLoc3D(
+        ModelConfig(
+            voxel_sizes=(0.2,), kept_branches=0, refinement="none", channels=16, fused_channels=32, clusters=4,
+            descriptor_size=8,
+        )
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save_checkpoint(path, model, PreprocessingConfig(half_extent_m=20.0, n_points=256, min_points=40), dtype="float32")
+    return path

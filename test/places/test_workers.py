@@ -16,28 +16,13 @@ import numpy as np
 import psutil
 import pytest
 
-from crossloc3d_ros.config import BuildConfig, ModelConfig, PreprocessingConfig
-from crossloc3d_ros.encoder.checkpoint import load_encoder, save_checkpoint
-from crossloc3d_ros.encoder.model import CrossLoc3D
+from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import AerialDataError, ConfigError, CrossLocError
 from crossloc3d_ros.formats.las import write_laz
 from crossloc3d_ros.places import store
 from crossloc3d_ros.places.builder import BuildProgress, build_map, work_folder
 from crossloc3d_ros.places.store import AerialMap
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny network of the real kind: a worker process can load it, unlike a class of this test."""
-    model = CrossLoc3D(
-        ModelConfig(
-            voxel_sizes=(0.2,), kept_branches=0, refinement="none", channels=16, fused_channels=32, clusters=4,
-            descriptor_size=8,
-        )
-    )  # fmt: skip
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    save_checkpoint(path, model, PreprocessingConfig(half_extent_m=20.0, n_points=256, min_points=40), dtype="float32")
-    return path
 
 
 @pytest.fixture(scope="module")
