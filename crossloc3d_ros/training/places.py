@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -191,12 +192,14 @@ def _training_town(
     reach_m = preprocessing.scan_half_extent_m * _DIAGONAL
     whole = dataclasses.replace(preprocessing, scan_half_extent_m=reach_m, n_points=_MOST_SCAN_POINTS)
     places: list[Float64Array] = []
+    headings: list[float] = []
     scans: list[Float32Array] = []
     for pose in poses:
         scan, scan_config, up = scan_town(driven, pose, config, rng)
         patch = prepare_scan(scan, scan_config, whole, up).patch
         if patch is not None:
             places.append(pose[:2, 3])
+            headings.append(math.atan2(pose[1, 0], pose[0, 0]))
             scans.append(patch.points[: patch.source_count] * np.float32(100.0 * reach_m))
     above = above_ground[above_ground[:, 2] >= preprocessing.ground_clearance_m].astype(np.float32)
     if preprocessing.thin_m > 0 and len(above):
@@ -205,6 +208,7 @@ def _training_town(
     return TrainingTown(
         name=Path(task.file).stem,
         scan_xy_m=np.array(places).reshape(-1, 2),
+        scan_heading_rad=np.array(headings),
         scan_points_cm=np.rint(np.concatenate([np.empty((0, 3), np.float32), *scans])).astype(np.int16),
         scan_starts=np.cumsum([0, *(len(scan) for scan in scans)]).astype(np.int64),
         survey_points=above,

@@ -17,7 +17,7 @@ from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 MANIFEST = "manifest.json"
-FORMAT = 1
+FORMAT = 2
 TRAINING = "train"
 VALIDATION = "validation"
 
@@ -31,6 +31,8 @@ class TrainingTown:
     name: str
     scan_xy_m: Float64Array
     """(S, 2) where the scans were taken, town frame."""
+    scan_heading_rad: Float64Array
+    """(S,) the robot's true heading, counter-clockwise from east."""
     scan_points_cm: Int16Array
     """(N, 3) above-ground points of all scans, one scan after the other: from the sensor along the robot's heading,
     z above the ground, centimetres."""
@@ -104,7 +106,7 @@ def write_town(path: Path, town: TrainingTown | ValidationTown) -> None:
 
 def read_training_town(path: Path) -> TrainingTown:
     """Read one town; a missing or damaged file raises TrainingError."""
-    arrays = _read_arrays(path, ("scan_xy_m", "scan_points_cm", "scan_starts", "survey_points"))
+    arrays = _read_arrays(path, ("scan_xy_m", "scan_heading_rad", "scan_points_cm", "scan_starts", "survey_points"))
     return TrainingTown(name=path.stem, **arrays)
 
 
