@@ -31,3 +31,7 @@ class BagError(CrossLocError):
 
 class TrainingError(CrossLocError):
     """A set of training places or a training run is missing, damaged or does not fit the other."""
+
+
+class EvaluationError(CrossLocError):
+    """An evaluation set or predictions are missing, damaged or do not belong together."""
