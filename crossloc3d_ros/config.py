@@ -40,14 +40,18 @@ class PreprocessingConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that the paper varies."""
+    """Everything that the paper varies, and the networks that it is compared with."""
 
+    network: Literal[
+        "crossloc3d", "pointnetvlad", "lpdnet", "minkloc3d", "minkloc3dv2", "minkloc3d_s", "transloc3d"
+    ] = option("crossloc3d", "which network; the others read only what they have of the settings below")
     voxel_sizes: tuple[float, ...] = option((0.05, 0.12, 0.4), "grains, fine to coarse, in patch units; 1 to 4")
     kept_branches: int = option(3, "receptive fields kept of the five; 0 = no selection", low=0, high=5)
     refinement: Literal["coarse_to_fine", "fine_to_coarse", "none"] = option("coarse_to_fine", "none = concatenation")
     sub_steps: int = option(3, "refinement layers a grain", low=1, high=8)
     memory_sizes: tuple[int, ...] = option((256, 128, 128, 128, 64, 64, 32, 32, 32), "centres of each refinement layer")
     time_embedding: bool = option(True, "whether the layers are told their number")
+    position: Literal["none", "radial", "cartesian"] = option("none", "what each voxel knows of where it lies")
     channels: int = option(64, "width of the backbone", low=8, high=512)
     heads: int = option(4, "attention heads", low=1, high=16)
     fused_channels: int = option(512, "width before the pooling", low=8, high=4096)
@@ -175,13 +179,19 @@ class TrainConfig:
     learning_rate: float = option(1e-3, "highest learning rate of AdamW", low=1e-7, high=1.0)
     final_share: float = option(0.01, "learning rate at the end, as a share of the highest", low=0.0, high=1.0)
     warm_up: float = option(0.04, "share of the budget in which the learning rate rises", low=0.0, high=1.0)
+    cooldown: float = option(1.0, "last share of the budget, in which the learning rate falls", low=0.0, high=1.0)
+    milestones: tuple[float, ...] = option((), "shares at which it falls to a tenth, not by the cooldown", low=0.0)
     weight_decay: float = option(1e-3, "of AdamW", low=0.0, high=1.0)
     clip_norm: float = option(5.0, "longest gradient", low=0.0, high=1e6)
     ema_decay: float = option(0.99, "of the averaged weights, once warm", low=0.0, high=1.0)
+    headings: int = option(1, "1: learn not to mind the heading; more: the query is tried in so many", low=1, high=64)
     offset_m: float = option(9.5, "a submap's centre lies at most so far from its scan, each way", low=0.0, high=100.0)
-    neighbour_m: float = option(50.0, "nearer places of one town are neither match nor mismatch", low=0.0, high=1e4)
+    neighbour_m: float = option(20.0, "nearer places of one town are neither match nor mismatch", low=0.0, high=1e4)
+    near_share: float = option(0.5, "share of places drawn near another of the batch: hard negatives", low=0, high=1)
+    near_m: float = option(60.0, "how near that is", low=0.0, high=1e4)
     keep_points: float = option(0.8, "least share of a scan's points that augmentation keeps", low=0.1, high=1.0)
     sector_share: float = option(0.3, "share of scans with a blocked sector of up to 90 degrees", low=0.0, high=1.0)
+    headings: int = option(1, "1 = invariance to heading; more = in how many a query is encoded", low=1, high=64)
     seed: int = option(1, "of weights, batches and augmentation", low=0, high=2**31 - 1)
     threads: int = option(1, "of torch", low=1, high=256)
     device: Literal["cpu", "cuda"] = option("cpu", "where to train")

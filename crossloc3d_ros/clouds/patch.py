@@ -7,6 +7,7 @@ order in which a sensor or a file happens to deliver the points.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -159,6 +160,16 @@ def patch_of_cropped(
             return None
     chosen, available = choose_points(cropped, config.n_points, config.thin_m, config.seed)
     return Patch(chosen / np.float32(half_extent_m), half_extent_m, available)
+
+
+def turn(points: Float32Array, angle_rad: float) -> Float32Array:
+    """Return points (n, 3) turned about z, counter-clockwise seen from above."""
+    cosine, sine = np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad))
+    turned = np.empty_like(points)
+    turned[:, 0] = cosine * points[:, 0] - sine * points[:, 1]
+    turned[:, 1] = sine * points[:, 0] + cosine * points[:, 1]
+    turned[:, 2] = points[:, 2]
+    return turned
 
 
 def _recentred(points: Float32Array, half_extent_m: float, config: PreprocessingConfig, origin: Origin) -> Float32Array:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from crossloc3d_ros.config import ModelConfig
+from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.sparse import VoxelGrid, sparse_convolution, voxelize
 from crossloc3d_ros.errors import ConfigError
 
@@ -106,6 +107,36 @@ class SelectionBlock(nn.Module):
         return (gate * stacked).sum(dim=1)
 
 
+class PositionEmbedding(nn.Module):
+    """Tell each voxel where it lies: waves of its coordinates -> Linear, zero at first.
+
+    Convolutions and pooling look the same wherever a thing stands; this is what lets a descriptor say "a wall ten
+    metres to the left". `radial` knows the distance from the centre and the height, which no turn about z changes;
+    `cartesian` knows x, y and z. Not in the published network.
+    """
+
+    WAVES = (0.5, 1.0, 2.0, 4.0)
+    """Periods of each wave over the patch unit."""
+
+    def __init__(self, kind: str, channels: int) -> None:
+        super().__init__()
+        self.kind = kind
+        axes = 2 if kind == "radial" else 3
+        self.linear = nn.Linear(axes * (1 + 2 * len(self.WAVES)), channels, bias=False)
+        nn.init.zeros_(self.linear.weight)
+
+    def features(self, centres: Tensor) -> Tensor:
+        """Return the waves (N, F) at positions (N, 3) in patch units."""
+        if self.kind == "radial":
+            centres = torch.stack((centres[:, :2].norm(dim=1), centres[:, 2]), dim=1)
+        angles = [math.pi * wave * centres for wave in self.WAVES]
+        return torch.cat((centres, *(a.sin() for a in angles), *(a.cos() for a in angles)), dim=1)
+
+    def forward(self, centres: Tensor) -> Tensor:
+        embedded: Tensor = self.linear(self.features(centres))
+        return embedded
+
+
 class Grain(nn.Module):
     """The encoder of one voxel size: points -> features (N, C) on the grid of stride 2."""
 
@@ -114,6 +145,7 @@ class Grain(nn.Module):
         self.voxel_size = voxel_size
         self.stem = ConvolutionNorm(1, config.channels, 5)
         self.down = ConvolutionNorm(config.channels, config.channels, 3)
+        self.position = PositionEmbedding(config.position, config.channels) if config.position != "none" else None
         self.selection = SelectionBlock(config.channels, config.kept_branches)
 
     def forward(self, clouds: Sequence[Tensor]) -> tuple[Tensor, VoxelGrid]:
@@ -121,7 +153,10 @@ class Grain(nn.Module):
         ones = torch.ones(len(grid.coords), 1, device=grid.coords.device, dtype=self.stem.weight.dtype)
         coarse = grid.downsample()
         x = F.relu(self.stem(ones, grid))
-        x = F.relu(self.down(x, grid, coarse))
+        x = self.down(x, grid, coarse)
+        if self.position is not None:
+            x = x + self.position(site_centres(coarse, self.voxel_size).to(x))
+        x = F.relu(x)
         return self.selection(x, coarse), coarse
 
 
@@ -228,7 +263,7 @@ class NetVlad(nn.Module):
         return gated
 
 
-class CrossLoc3D(nn.Module):
+class CrossLoc3D(Network):
     """Clouds of points in [-1, 1]^3 to descriptors; distances between descriptors are Euclidean."""
 
     def __init__(self, config: ModelConfig = CAMPUS) -> None:
@@ -259,6 +294,11 @@ class CrossLoc3D(nn.Module):
         starts[1:] = torch.cumsum(torch.bincount(batch, minlength=n_clouds), 0).cpu()
         descriptors: Tensor = self.pooling(x[order], starts)
         return descriptors
+
+
+def site_centres(grid: VoxelGrid, voxel_size: float) -> Tensor:
+    """Return (N, 3), the middles of the sites in patch units."""
+    return (grid.coords + 0.5 * grid.stride) * voxel_size
 
 
 def cloud_mean(x: Tensor, grid: VoxelGrid) -> Tensor:

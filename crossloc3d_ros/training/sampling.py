@@ -9,14 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from crossloc3d_ros.clouds.patch import make_patch
+from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training.shards import TrainingTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 _CELL_M = 10.0
-_ATTEMPTS = 50
+_ATTEMPTS = 60
+_HEADING_MARGIN = 1.25
+"""How far beyond half the step between two headings the weights learn to follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +30,7 @@ class Batch:
     submaps: list[Float32Array]
     """P patches (n, 3); row i belongs to scan i."""
     ignored: BoolArray
-    """(P, P) pairs of one town too near to call different and not the same; False on the diagonal."""
+    """(P, P) scan i and submap j of one town, too near to call different and not the same; False on the diagonal."""
 
 
 class PointField:
@@ -81,42 +83,55 @@ class BatchSampler:
         scans: list[Float32Array] = []
         submaps: list[Float32Array] = []
         owners = np.sort(np.arange(config.pairs) % drawn)
-        positions = np.empty((config.pairs, 2))
+        places = np.empty((config.pairs, 2))
+        centres = np.empty((config.pairs, 2))
         for i, owner in enumerate(owners):
             town = int(chosen[owner])
-            scan, submap, positions[i] = self._pair(town, rng, positions[:i][owners[:i] == owner])
+            scan, submap, places[i], centres[i] = self._pair(town, rng, places[:i][owners[:i] == owner])
             scans.append(scan)
             submaps.append(submap)
-        apart = np.hypot(*(positions[:, None] - positions[None]).transpose(2, 0, 1))
+        apart = np.hypot(*(places[:, None] - centres[None]).transpose(2, 0, 1))
         ignored = (owners[:, None] == owners[None, :]) & (apart < config.neighbour_m)
         np.fill_diagonal(ignored, False)
         return Batch(scans, submaps, ignored)
 
     def _pair(
         self, town_index: int, rng: np.random.Generator, taken: Float64Array
-    ) -> tuple[Float32Array, Float32Array, Float64Array]:
-        """Return a scan, a submap that it lies in and the scan's place, if possible away from the places `taken`."""
+    ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array]:
+        """Return a scan, a submap that it lies in, the scan's place and the submap's centre.
+
+        The place is not yet among those `taken`, and with probability `near_share` it is near one of them.
+        """
         town, field, config = self._towns[town_index], self._fields[town_index], self._config
         preprocessing = config.preprocessing
+        wish_near = len(taken) > 0 and rng.random() < config.near_share
         for attempt in range(_ATTEMPTS):
             index = int(rng.integers(len(town)))
             place = town.scan_xy_m[index]
-            far = len(taken) == 0 or float(np.hypot(*(taken - place).T).min()) >= config.neighbour_m
-            if not far and attempt < _ATTEMPTS // 5:
+            nearest_m = float(np.hypot(*(taken - place).T).min()) if len(taken) else math.inf
+            far_enough = nearest_m >= config.neighbour_m
+            as_wished = far_enough and (not wish_near or nearest_m <= config.near_m)
+            if (not as_wished and attempt < _ATTEMPTS // 2) or (not far_enough and attempt < 3 * _ATTEMPTS // 4):
                 continue
-            mirrored = bool(rng.integers(2))
-            scan_points = _augment(town.scan_points(index), rng, config)
-            scan_points = _turn(scan_points, float(rng.uniform(0.0, 2.0 * math.pi)))
+            scan = make_patch(
+                _augment(town.scan_points(index), rng, config), preprocessing.scan_half_extent_m, preprocessing
+            )
             centre = place + rng.uniform(-config.offset_m, config.offset_m, 2)
             heading = float(rng.uniform(0.0, 2.0 * math.pi))
             submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
+            mirrored = bool(rng.integers(2))
+            if mirrored:
+                submap_points[:, 1] *= -1.0
+            submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
+            if scan is None or submap is None:
+                continue
+            # One heading: the weights learn not to mind it. Several: one of the turned queries is nearly right.
+            error = math.pi if config.headings == 1 else _HEADING_MARGIN * math.pi / config.headings
+            angle = float(town.scan_heading_rad[index]) - heading + float(rng.uniform(-error, error))
+            scan_points = turn(scan.points, angle)
             if mirrored:
                 scan_points[:, 1] *= -1.0
-                submap_points[:, 1] *= -1.0
-            scan = make_patch(scan_points, preprocessing.scan_half_extent_m, preprocessing)
-            submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
-            if scan is not None and submap is not None:
-                return scan.points, submap.points, place
+            return scan_points, submap.points, place, centre
         raise TrainingError(
             f"{town.name}: {_ATTEMPTS} scans in a row gave no pair of patches with at least "
             f"{preprocessing.min_points} points; lower min_points or make other places"
@@ -131,16 +146,6 @@ def _augment(points: Float32Array, rng: np.random.Generator, config: TrainConfig
         width = rng.uniform(0.0, math.pi / 2.0)
         kept &= np.mod(bearing - rng.uniform(0.0, 2.0 * math.pi), 2.0 * math.pi) >= width
     return points[kept]
-
-
-def _turn(points: Float32Array, angle_rad: float) -> Float32Array:
-    """Return the points turned about z."""
-    cosine, sine = np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad))
-    turned = np.empty_like(points)
-    turned[:, 0] = cosine * points[:, 0] - sine * points[:, 1]
-    turned[:, 1] = sine * points[:, 0] + cosine * points[:, 1]
-    turned[:, 2] = points[:, 2]
-    return turned
 
 
 @njit(cache=True, nogil=True)
