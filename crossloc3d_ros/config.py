@@ -191,7 +191,6 @@ class TrainConfig:
     near_m: float = option(60.0, "how near that is", low=0.0, high=1e4)
     keep_points: float = option(0.8, "least share of a scan's points that augmentation keeps", low=0.1, high=1.0)
     sector_share: float = option(0.3, "share of scans with a blocked sector of up to 90 degrees", low=0.0, high=1.0)
-    headings: int = option(1, "1 = invariance to heading; more = in how many a query is encoded", low=1, high=64)
     seed: int = option(1, "of weights, batches and augmentation", low=0, high=2**31 - 1)
     threads: int = option(1, "of torch", low=1, high=256)
     device: Literal["cpu", "cuda"] = option("cpu", "where to train")

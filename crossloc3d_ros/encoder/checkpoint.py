@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,21 +18,31 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, from_dict, to_dict
-from crossloc3d_ros.encoder.model import CrossLoc3D
+from crossloc3d_ros.encoder.base import Network
+from crossloc3d_ros.encoder.networks import make_network
 from crossloc3d_ros.encoder.runtime import Encoder
 from crossloc3d_ros.errors import CheckpointError, ConfigError
+
+T = TypeVar("T")
 
 FORMAT = "crossloc3d_ros/1"
 WEIGHTS_FOLDER = Path(__file__).resolve().parents[1] / "weights"
 SHIPPED_WEIGHTS = WEIGHTS_FOLDER / "crossloc3d_first.safetensors"
 _SMALL = 4096
 """Tensors of at most this many numbers are never stored as float16."""
+_ALWAYS_COUNTED = {
+    "voxel_sizes", "kept_branches", "refinement", "sub_steps", "memory_sizes", "time_embedding", "channels", "heads",
+    "fused_channels", "clusters", "descriptor_size", "half_extent_m", "scan_half_extent_m", "n_points",
+    "ground_clearance_m", "thin_m", "min_points", "scan_origin", "submap_origin", "vertical_origin", "seed",
+}  # fmt: skip
+"""The settings of the first weights. One that came later counts in a fingerprint only where it is not at its default,
+so that a new setting leaves maps and weights that know nothing of it as they are."""
 
 
 class Checkpoint(NamedTuple):
     """What a weights file holds."""
 
-    model: CrossLoc3D
+    model: Network
     preprocessing: PreprocessingConfig
     metadata: dict[str, str]
     """What the writer noted besides: training, data, calibration."""
@@ -41,7 +51,7 @@ class Checkpoint(NamedTuple):
 
 def save_checkpoint(
     path: Path,
-    model: CrossLoc3D,
+    model: Network,
     preprocessing: PreprocessingConfig,
     metadata: Mapping[str, str] | None = None,
     dtype: Literal["float16", "float32"] = "float16",
@@ -90,7 +100,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     try:
         config = from_dict(ModelConfig, json.loads(header["model"]))
         preprocessing = from_dict(PreprocessingConfig, json.loads(header["preprocessing"]))
-        model = CrossLoc3D(config)
+        model = make_network(config)
     except (KeyError, json.JSONDecodeError, ConfigError) as error:
         raise CheckpointError(f"{path} carries no usable configuration: {error}") from error
     expected = model.state_dict()
@@ -109,14 +119,21 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model.eval(), preprocessing, notes, fingerprint(model, preprocessing))
 
 
-def fingerprint(model: CrossLoc3D, preprocessing: PreprocessingConfig) -> str:
+def fingerprint(model: Network, preprocessing: PreprocessingConfig) -> str:
     """Return 16 hexadecimal digits that change with any weight, any model setting and any preprocessing setting."""
     digest = hashlib.sha256()
-    digest.update(json.dumps([to_dict(model.config), to_dict(preprocessing)], sort_keys=True).encode())
+    settings = [_counted(model.config, ModelConfig()), _counted(preprocessing, PreprocessingConfig())]
+    digest.update(json.dumps(settings, sort_keys=True).encode())
     for key, tensor in sorted(model.state_dict().items()):
         digest.update(key.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
+
+
+def _counted(config: T, default: T) -> dict[str, Any]:
+    """Return the settings that tell one encoder from another."""
+    usual = to_dict(default)
+    return {key: value for key, value in to_dict(config).items() if key in _ALWAYS_COUNTED or value != usual[key]}
 
 
 def load_encoder(path: Path | None = None, device: str = "cpu", threads: int | None = None) -> Encoder:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PreprocessingConfig, from_dict
+from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import CheckpointError, CloudError, ConfigError
@@ -24,7 +25,7 @@ class Encoder:
 
     def __init__(
         self,
-        model: CrossLoc3D,
+        model: Network,
         preprocessing: PreprocessingConfig,
         fingerprint: str,
         *,
@@ -35,7 +36,7 @@ class Encoder:
         self._model = model.eval().to(device)
         self._device = device
         self._compiled = None
-        if device == "cpu" and CompiledModel.can_compile(model):
+        if device == "cpu" and isinstance(model, CrossLoc3D) and CompiledModel.can_compile(model):
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             self._compiled = CompiledModel(model, min(cores, MAX_THREADS) if threads is None else threads)
         self._preprocessing = preprocessing
