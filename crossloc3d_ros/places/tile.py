@@ -108,15 +108,15 @@ def build_tile(task: TileTask, encoder: DescriptorEncoder, advance: Callable[[in
     ground_at = time.perf_counter()
     terrain = terrain_raster(points, is_ground, outer, config.cell_m)
     surface = surface_raster(points, outer, config.cell_m)
-    distance_m = _distance_to_points(surface)
+    distance_m = distance_to_points(surface)
     heights = points[:, 2] - terrain.sample(points[:, 0], points[:, 1])
     raster_at = time.perf_counter()
 
     cutter = SubmapCutter(np.column_stack([points[:, :2], heights]), preprocessing)
     centres = submap_centres(inner, config.spacing_m)
-    covered = _coverage(distance_m, surface, centres, preprocessing.half_extent_m) >= config.min_coverage
-    ground_heights = _ground_heights(terrain, centres)
-    covered &= np.isfinite(ground_heights)
+    covered = coverage(distance_m, surface, centres, preprocessing.half_extent_m) >= config.min_coverage
+    heights_m = ground_heights(terrain, centres)
+    covered &= np.isfinite(heights_m)
     if advance is not None:
         advance(int((~covered).sum()))
     cut_s = time.perf_counter() - raster_at
@@ -132,7 +132,7 @@ def build_tile(task: TileTask, encoder: DescriptorEncoder, advance: Callable[[in
         if patches:
             descriptors.append(encoder.encode_batch([patch.points for _, patch in patches]))
         for i, patch in patches:
-            places.append((centres[i, 0], centres[i, 1], ground_heights[i], patch.source_count))
+            places.append((centres[i, 0], centres[i, 1], heights_m[i], patch.source_count))
         cut_s += encode_from - cut_from
         encode_s += time.perf_counter() - encode_from
         if advance is not None:
@@ -226,7 +226,7 @@ def _report(encoded: UInt8Array) -> TileReport:
     return TileReport(**values)
 
 
-def _distance_to_points(surface: Raster) -> Float32Array:
+def distance_to_points(surface: Raster) -> Float32Array:
     """Return each cell's distance to the nearest cell that holds a point, metres; infinite where there is none."""
     empty = np.isnan(surface.values)
     if empty.all():
@@ -235,7 +235,7 @@ def _distance_to_points(surface: Raster) -> Float32Array:
     return np.asarray(distance * surface.cell_m, dtype=np.float32)
 
 
-def _coverage(distance_m: Float32Array, surface: Raster, centres: Float64Array, half_extent_m: float) -> Float64Array:
+def coverage(distance_m: Float32Array, surface: Raster, centres: Float64Array, half_extent_m: float) -> Float64Array:
     """Return the share (M,) of each submap's square that was flown over."""
     side = max(1, round(2.0 * half_extent_m / surface.cell_m))
     flown = (distance_m <= _FLOWN_REACH_M).astype(np.float32)
@@ -245,7 +245,8 @@ def _coverage(distance_m: Float32Array, surface: Raster, centres: Float64Array, 
     return np.asarray(share[rows, columns], dtype=np.float64)
 
 
-def _ground_heights(terrain: Raster, centres: Float64Array) -> Float64Array:
+def ground_heights(terrain: Raster, centres: Float64Array) -> Float64Array:
+    """Return the ground's height (M,) at centres (M, 2), NaN beyond the raster."""
     return np.asarray(terrain.sample(centres[:, 0], centres[:, 1]), dtype=np.float64)
 
 
