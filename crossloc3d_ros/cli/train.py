@@ -37,11 +37,14 @@ def _parser() -> argparse.ArgumentParser:
     places.set_defaults(action=_make_places)
 
     run = commands.add_parser("run", help="train until the budget is used")
-    run.add_argument("--places", type=Path, required=True, help="folder of make-places")
+    run.add_argument(
+        "--places", type=Path, required=True, action="append", help="folder of make-places; may be repeated"
+    )
     run.add_argument("--output", type=Path, required=True, help="folder of the run")
     budget = run.add_mutually_exclusive_group(required=True)
     budget.add_argument("--budget-minutes", type=float, help="time on the clock, validation included")
     budget.add_argument("--budget-steps", type=int, help="batches: the same run to the bit, however often resumed")
+    run.add_argument("--initial", type=Path, metavar="WEIGHTS", help="begin with what fits of these weights")
     run.add_argument("--resume", action="store_true", help="go on with the run in --output")
     run.add_argument("--config", type=Path, help="YAML file of which `train` is read")
     common.add_options(run, TrainConfig)
@@ -51,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
         "export", help="write the weights of a run, also of one that is still going or was killed"
     )
     export.add_argument("run", type=Path, help="folder of the run")
-    export.add_argument("--places", type=Path, help="folder of make-places, if it has moved")
+    export.add_argument("--places", type=Path, action="append", default=[], help="where its places are, if moved")
     export.add_argument(
         "--output", type=Path, required=True, help="file to write (.safetensors); the card lies beside it"
     )
@@ -89,7 +92,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
     budget = Budget(minutes=arguments.budget_minutes, steps=arguments.budget_steps)
     config = _train_config(arguments)
-    trainer = Trainer(config, arguments.places, arguments.output, budget, report=_progress(common.console()))
+    show = _progress(common.console())
+    trainer = Trainer(config, arguments.places, arguments.output, budget, arguments.initial, report=show)
     validation = trainer.run(resume=arguments.resume)
     trainer.write_card()
     for recall in validation.recalls:

@@ -9,30 +9,24 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from crossloc3d_ros.config import TrainConfig
-from crossloc3d_ros.encoder.model import CrossLoc3D
+from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
-from crossloc3d_ros.training.loss import BatchHardTriplet, InfoNCE
+from crossloc3d_ros.training.initial import Initial, read_initial, take_over
+from crossloc3d_ros.training.loss import InfoNCE
+from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.memory import keep_freed_memory
 from crossloc3d_ros.training.model_card import model_card
 from crossloc3d_ros.training.sampling import BatchSampler
-from crossloc3d_ros.training.shards import (
-    TRAINING,
-    VALIDATION,
-    Manifest,
-    ValidationTown,
-    read_manifest,
-    read_training_town,
-    read_validation_town,
-    write_text,
-)
+from crossloc3d_ros.training.schedule import Budget, learning_rate
+from crossloc3d_ros.training.shards import ValidationTown, write_text
+from crossloc3d_ros.training.state import RunState, average, new_state
 from crossloc3d_ros.training.validation import Validation, validate
 from crossloc3d_ros.types import Float32Array
 
@@ -42,31 +36,6 @@ _ENCODE_BATCH = 32
 _NORM_BATCHES = 8
 _NORM_STEP = 2**40  # batches for the norm statistics come from beyond any run's own
 _MOST_BAD_STEPS = 20
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How long to learn: minutes on the clock, or a number of steps, which makes a run repeatable to the bit."""
-
-    minutes: float | None = None
-    steps: int | None = None
-
-    def __post_init__(self) -> None:
-        if (self.minutes is None) == (self.steps is None):
-            raise TrainingError("give the training either minutes or steps")
-        if (self.minutes or self.steps or 0) <= 0:
-            raise TrainingError("the training's budget must be positive")
-
-    def option(self) -> str:
-        """Return the budget as it is said on the command line."""
-        return f"--budget-steps {self.steps}" if self.steps is not None else f"--budget-minutes {self.minutes:g}"
-
-    def share(self, elapsed_s: float, step: int) -> float:
-        """Return how much of the budget is used, 1 at its end."""
-        if self.steps is not None:
-            return step / self.steps
-        assert self.minutes is not None
-        return elapsed_s / (60.0 * self.minutes)
 
 
 @dataclass(frozen=True)
@@ -83,53 +52,15 @@ class Progress:
 
 
 @dataclass
-class RunState:
-    """Everything that a run needs in order to go on as if it had never stopped."""
-
-    model: CrossLoc3D
-    averaged: CrossLoc3D
-    criterion: nn.Module
-    optimizer: torch.optim.Optimizer
-    step: int = 0
-    elapsed_s: float = 0.0
-    best_recall: float = -1.0
-    last_validation_s: float = 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the state as what `torch.load(weights_only=True)` reads back."""
-        return {
-            "model": self.model.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "criterion": self.criterion.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "step": self.step,
-            "elapsed_s": self.elapsed_s,
-            "best_recall": self.best_recall,
-            "last_validation_s": self.last_validation_s,
-            "torch_rng": torch.get_rng_state(),
-        }
-
-    def load_dict(self, content: dict[str, Any]) -> None:
-        """Take over a state; strict about every name and shape."""
-        self.model.load_state_dict(content["model"])
-        self.averaged.load_state_dict(content["averaged"])
-        self.criterion.load_state_dict(content["criterion"])
-        self.optimizer.load_state_dict(content["optimizer"])
-        self.step = content["step"]
-        self.elapsed_s = content["elapsed_s"]
-        self.best_recall = content["best_recall"]
-        self.last_validation_s = content["last_validation_s"]
-        torch.set_rng_state(content["torch_rng"])
-
-
-@dataclass
 class Trainer:
-    """One run over one set of places in one folder."""
+    """One run over folders of places, in a folder of its own."""
 
     config: TrainConfig
-    places: Path
+    places: Sequence[Path]
     folder: Path
     budget: Budget
+    initial: Path | None = None
+    """Weights to begin with; a resumed run has its own."""
     report: Callable[[Progress], None] = field(default=lambda progress: None)
     clock: Callable[[], float] = time.monotonic
 
@@ -137,36 +68,49 @@ class Trainer:
         """Train until the budget is used, validate, write the weights and return the last validation.
 
         A folder that holds a run already is refused unless `resume`; resuming goes on with the saved state, and with
-        a budget in steps it ends with the same weights as a run that was never stopped.
+        a budget in steps it ends with the same weights as a run that was never stopped. The budget of a resumed run
+        may be another one.
         """
         config = self.config
         torch.set_num_threads(config.threads)
         keep_freed_memory()
-        manifest = read_manifest(self.places)
-        run_folder.prepare(self.folder, config, manifest, self.places, resume=resume)
-        sampler = BatchSampler([read_training_town(self.places / t.file) for t in manifest.of_role(TRAINING)], config)
-        held_out = load_validation(self.places, manifest)
-        state = new_state(config)
-        saved = run_folder.load_state(self.folder) if resume else None
-        if saved is not None:
-            state.load_dict(saved)
-        log = run_folder.Log(self.folder, state.step)
-        log.write(
-            "start", step=state.step, elapsed_s=round(state.elapsed_s, 1), budget=self.budget.option(),
-            **run_folder.machine(config),
-        )  # fmt: skip
+        material = read_material(self.places, config.preprocessing)
+        initial = None if self.initial is None else read_initial(self.initial, config.model)
+        initial = run_folder.prepare(self.folder, config, material, initial, resume=resume)
+        sampler = BatchSampler(material.training_towns(), config)
+        held_out = material.validation_towns()
+        log, state = self._begin(initial, resume=resume)
         self._learn(state, sampler, held_out, log)
         state.averaged = with_fresh_norms(state.averaged, sampler, config)
         validation = self._validate(state, held_out, log, state.averaged)
         run_folder.save_state(self.folder, state.to_dict())
-        run_folder.export(self.folder / run_folder.FINAL, state.averaged, config, self._metadata(state, validation))
+        metadata = self._metadata(state, validation)
+        run_folder.export(self.folder / run_folder.FINAL, state.averaged, config, metadata)
         return validation
 
     def write_card(self) -> Path:
         """Write the model card of the run into its folder and return its path."""
         path = self.folder / run_folder.MODEL_CARD
-        write_text(path, model_card(self.folder, read_manifest(self.places)))
+        write_text(path, model_card(self.folder, read_material(self.places)))
         return path
+
+    def _begin(self, initial: Initial | None, *, resume: bool) -> tuple[run_folder.Log, RunState]:
+        """Return the state to go on from and the log: the saved state, or the one that the run begins with."""
+        state = new_state(self.config)
+        saved = run_folder.load_state(self.folder) if resume else None
+        log = run_folder.Log(self.folder, saved["step"] if saved is not None else -1)
+        if saved is not None:
+            state.load_dict(saved)
+        elif initial is not None:
+            taken = take_over(state.model, initial)
+            state.averaged.load_state_dict(state.model.state_dict())
+            logger.info("%s: %s", initial.path, taken.sentence())
+            log.write("initial", step=0, weights=str(initial.path), **asdict(taken))
+        log.write(
+            "start", step=state.step, elapsed_s=round(state.elapsed_s, 1), budget=self.budget.option(),
+            **run_folder.machine(self.config),
+        )  # fmt: skip
+        return log, state
 
     def _learn(
         self, state: RunState, sampler: BatchSampler, held_out: Sequence[ValidationTown], log: run_folder.Log
@@ -221,10 +165,10 @@ class Trainer:
                 run_folder.save_state(self.folder, state.to_dict())
 
     def _validate(
-        self, state: RunState, held_out: Sequence[ValidationTown], log: run_folder.Log, model: CrossLoc3D
+        self, state: RunState, held_out: Sequence[ValidationTown], log: run_folder.Log, model: Network
     ) -> Validation:
         began = time.monotonic()
-        validation = validate(held_out, lambda clouds: encode(model, clouds, self.config.device))
+        validation = validate(held_out, lambda clouds: encode(model, clouds, self.config.device), self.config.headings)
         log.write(
             "validation", step=state.step, elapsed_s=round(state.elapsed_s, 1),
             seconds=round(time.monotonic() - began, 1), **asdict(validation),
@@ -232,57 +176,37 @@ class Trainer:
         return validation
 
     def _metadata(self, state: RunState, validation: Validation) -> dict[str, str]:
-        return run_folder.metadata(self.config, state.step, state.elapsed_s, validation)
+        history = run_folder.history(self.folder)
+        return run_folder.metadata(self.config, state.step, state.elapsed_s, validation, history)
 
 
-def export_run(folder: Path, output: Path, places: Path | None = None) -> Path:
+def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
     """Write the weights of a run as it was last saved, with their card beside them; return the card's path.
 
     The run may have ended, been killed or still be going on. The weights are validated first, so that the card and
-    the calibration in the weights are those of just these weights.
+    the calibration in the weights are those of just these weights. `places`: where the run's places are now.
     """
     config = run_folder.read_config(folder)
     torch.set_num_threads(config.threads)
-    places = places or Path(run_folder.read_settings(folder)["places"])
-    manifest = read_manifest(places)
+    settings = run_folder.read_settings(folder)
+    material = read_material(places or [Path(name) for name in settings.places])
+    if material.sha256() != settings.places_sha256:
+        raise TrainingError(f"the run in {folder} learned from other places than those named")
     saved = run_folder.load_state(folder)
     if saved is None:
         raise TrainingError(f"the run in {folder} has not saved a state yet")
     state = new_state(config)
     state.load_dict(saved)
-    sampler = BatchSampler([read_training_town(places / t.file) for t in manifest.of_role(TRAINING)], config)
-    model = with_fresh_norms(state.averaged, sampler, config)
-    validation = validate(load_validation(places, manifest), lambda clouds: encode(model, clouds, config.device))
+    model = with_fresh_norms(state.averaged, BatchSampler(material.training_towns(), config), config)
+    held_out = material.validation_towns()
+    validation = validate(held_out, lambda clouds: encode(model, clouds, config.device), config.headings)
     output.parent.mkdir(parents=True, exist_ok=True)
-    run_folder.export(output, model, config, run_folder.metadata(config, state.step, state.elapsed_s, validation))
+    notes = run_folder.metadata(config, state.step, state.elapsed_s, validation, run_folder.history(folder))
+    run_folder.export(output, model, config, notes)
     result = {"kind": "validation", "step": state.step, "elapsed_s": state.elapsed_s, **asdict(validation)}
     card = output.parent / run_folder.MODEL_CARD
-    write_text(card, model_card(folder, manifest, result))
+    write_text(card, model_card(folder, material, result))
     return card
-
-
-def new_state(config: TrainConfig) -> RunState:
-    """Return the state that a run begins with; the seed decides the weights."""
-    torch.manual_seed(config.seed)
-    model = CrossLoc3D(config.model).to(config.device).train()
-    averaged = copy.deepcopy(model).eval().requires_grad_(False)
-    criterion = (InfoNCE() if config.loss == "info_nce" else BatchHardTriplet(config.margin)).to(config.device)
-    matrices = [p for p in model.parameters() if p.ndim > 1]
-    others = [p for p in model.parameters() if p.ndim <= 1]
-    groups = [
-        {"params": matrices, "weight_decay": config.weight_decay},
-        {"params": [*others, *criterion.parameters()], "weight_decay": 0.0},
-    ]
-    return RunState(model, averaged, criterion, torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99)))
-
-
-def learning_rate(share: float, config: TrainConfig) -> float:
-    """Return the learning rate at a share of the budget: linear warm-up, then half a cosine."""
-    if share < config.warm_up:
-        return config.learning_rate * (0.01 + 0.99 * share / config.warm_up)
-    progress = min(1.0, (share - config.warm_up) / max(1e-9, 1.0 - config.warm_up))
-    cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
-    return config.learning_rate * (config.final_share + (1.0 - config.final_share) * cosine)
 
 
 def take_step(state: RunState, sampler: BatchSampler, rate: float, config: TrainConfig) -> float:
@@ -305,17 +229,7 @@ def take_step(state: RunState, sampler: BatchSampler, rate: float, config: Train
 
 
 @torch.no_grad()
-def average(averaged: nn.Module, model: nn.Module, decay: float) -> None:
-    """Move the averaged weights and statistics towards the model's: a = decay a + (1 - decay) w."""
-    mine, theirs = averaged.state_dict(), model.state_dict()
-    moving = [key for key, value in mine.items() if value.is_floating_point()]
-    torch._foreach_lerp_([mine[key] for key in moving], [theirs[key] for key in moving], 1.0 - decay)
-    for key in mine.keys() - set(moving):
-        mine[key].copy_(theirs[key])
-
-
-@torch.no_grad()
-def with_fresh_norms(model: CrossLoc3D, sampler: BatchSampler, config: TrainConfig) -> CrossLoc3D:
+def with_fresh_norms(model: Network, sampler: BatchSampler, config: TrainConfig) -> Network:
     """Return a copy whose batch norms hold the statistics of its own weights, not an average of older ones'."""
     fresh = copy.deepcopy(model).train()
     norms = [module for module in fresh.modules() if isinstance(module, nn.BatchNorm1d)]
@@ -332,21 +246,13 @@ def with_fresh_norms(model: CrossLoc3D, sampler: BatchSampler, config: TrainConf
 
 
 @torch.no_grad()
-def encode(model: CrossLoc3D, clouds: Sequence[Float32Array], device: str) -> Float32Array:
+def encode(model: Network, clouds: Sequence[Float32Array], device: str) -> Float32Array:
     """Return the descriptors (B, D) of patches."""
     parts = [
         model(_tensors(clouds[i : i + _ENCODE_BATCH], device)).float().cpu().numpy()
         for i in range(0, len(clouds), _ENCODE_BATCH)
     ]
     return np.concatenate(parts)
-
-
-def load_validation(places: Path, manifest: Manifest) -> list[ValidationTown]:
-    """Read the held-out towns; raises TrainingError where there are none."""
-    towns = [read_validation_town(places / town.file) for town in manifest.of_role(VALIDATION)]
-    if not towns or not any(len(t.query_xy_m) for t in towns) or not any(len(t.submap_xy_m) for t in towns):
-        raise TrainingError(f"{places} holds no towns to validate on; make them with `--validation-towns`")
-    return towns
 
 
 def _tensors(clouds: Sequence[Float32Array], device: str) -> list[Tensor]:

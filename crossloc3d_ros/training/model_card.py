@@ -6,19 +6,21 @@ import json
 from pathlib import Path
 from typing import Any
 
+from crossloc3d_ros.config import to_dict
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.material import Material
 from crossloc3d_ros.training.shards import TRAINING, VALIDATION, Manifest, TownEntry
 from crossloc3d_ros.training.validation import QUANTILES
 
 
-def model_card(folder: Path, manifest: Manifest, result: dict[str, Any] | None = None) -> str:
-    """Return the card of the run in `folder` over the places of `manifest`, as Markdown.
+def model_card(folder: Path, material: Material, result: dict[str, Any] | None = None) -> str:
+    """Return the card of the run in `folder` over the places of `material`, as Markdown.
 
     `result` is a validation in the form of the log's; without it the run's last one is taken. Raises TrainingError
     where there is none.
     """
-    settings = run_folder.read_settings(folder)["config"]
+    settings = to_dict(run_folder.read_config(folder))
     entries = run_folder.read_log(folder)
     validations = [entry for entry in entries if entry["kind"] == "validation"]
     steps = [entry for entry in entries if entry["kind"] == "step"]
@@ -35,7 +37,7 @@ def model_card(folder: Path, manifest: Manifest, result: dict[str, Any] | None =
         _results(last),
         _distances(last),
         _course(validations),
-        _data(manifest),
+        *(_data(manifest) for manifest in material.manifests),
         _training(settings, steps, starts, last, len(starts) - 1),
         _LIMITS,
     ]

@@ -5,11 +5,11 @@ Every file is written beside its place and moved into it, so that a kill or a fu
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import pickle
 import platform
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,12 @@ import numpy as np
 import torch
 
 from crossloc3d_ros.config import TrainConfig, from_dict, to_dict
+from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.checkpoint import save_checkpoint
-from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.training.shards import Manifest, write_text
+from crossloc3d_ros.training.initial import HISTORY, Initial, read_initial
+from crossloc3d_ros.training.material import Material
+from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.training.validation import QUANTILES, Validation
 
 SETTINGS = "run.json"
@@ -34,56 +36,89 @@ _FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "l
 """Settings that a resumed run may change: they do not touch the weights."""
 
 
-def prepare(folder: Path, config: TrainConfig, manifest: Manifest, places: Path, *, resume: bool) -> None:
-    """Make the folder of a new run, or check that the one to resume has the same settings and places."""
-    settings: dict[str, Any] = {
-        "config": to_dict(config),
-        "places": str(places),
-        "places_sha256": places_hash(manifest),
-    }
+@dataclass(frozen=True)
+class Settings:
+    """What a run was begun with."""
+
+    config: dict[str, Any]
+    places: tuple[str, ...]
+    places_sha256: str
+    initial: dict[str, Any] | None
+    """Weights that it began with: `path`, `fingerprint`, and `history`, the chain up to and with them."""
+
+
+def prepare(
+    folder: Path, config: TrainConfig, material: Material, initial: Initial | None, *, resume: bool
+) -> Initial | None:
+    """Make the folder of a new run, or check that the one to resume has the same settings, places and beginning.
+
+    Returns the weights that the run begins with: a run that was killed before it saved anything begins once more.
+    """
     path = folder / SETTINGS
+    noted = None
+    if initial is not None:
+        noted = {
+            "path": str(initial.path),
+            "fingerprint": initial.checkpoint.fingerprint,
+            "history": initial.history,
+        }
     if not resume:
+        settings = Settings(to_dict(config), tuple(map(str, material.folders)), material.sha256(), noted)
         if path.exists():
             raise TrainingError(f"{folder} holds a run already: go on with it by `--resume`, or name another folder")
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise TrainingError(f"cannot make {folder}: {error.strerror or error}") from error
-        write_text(path, json.dumps(settings, indent=1) + "\n")
-        return
+        write_text(path, json.dumps(asdict(settings), indent=1) + "\n")
+        return initial
     before = read_settings(folder)
-    if before["places_sha256"] != settings["places_sha256"]:
-        raise TrainingError(f"the run in {folder} learned from other places than those in {places}")
-    for key, value in settings["config"].items():
-        old = json.loads(json.dumps(before["config"].get(key)))
-        if key not in _FREE_TO_CHANGE and old != json.loads(json.dumps(value)):
-            raise TrainingError(f"the run in {folder} has '{key}' {old}, not {value}: a resumed run keeps its settings")
+    if before.places_sha256 != material.sha256():
+        raise TrainingError(f"the run in {folder} learned from other places than those named")
+    old = to_dict(read_config(folder))  # a setting that did not exist yet has its default
+    for key, value in to_dict(config).items():
+        if key not in _FREE_TO_CHANGE and old[key] != value:
+            raise TrainingError(
+                f"the run in {folder} has '{key}' {old[key]}, not {value}: a resumed run keeps its settings"
+            )
     for leftover in folder.glob(".*.partial"):
         leftover.unlink(missing_ok=True)
+    if noted is not None and (before.initial or {}).get("fingerprint") != noted["fingerprint"]:
+        raise TrainingError(f"the run in {folder} began with other weights; resume it without --initial")
+    if initial is None and before.initial is not None and not (folder / STATE).exists():
+        initial = read_initial(Path(before.initial["path"]), config.model)
+        if initial.checkpoint.fingerprint != before.initial["fingerprint"]:
+            raise TrainingError(f"{initial.path} no longer holds the weights that the run in {folder} began with")
+    return initial
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
+def read_settings(folder: Path) -> Settings:
     """Return what `prepare` wrote; raises TrainingError where the folder holds no run."""
     path = folder / SETTINGS
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-        return {key: content[key] for key in ("config", "places", "places_sha256")}
+        places = content["places"]
+        return Settings(
+            content["config"],
+            (places,) if isinstance(places, str) else tuple(places),  # a run of one folder, as once written
+            content["places_sha256"],
+            content.get("initial"),
+        )
     except FileNotFoundError as error:
         raise TrainingError(f"{folder} holds no training run") from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path} is damaged ({error})") from error
 
 
 def read_config(folder: Path) -> TrainConfig:
     """Return the configuration of a run."""
-    return from_dict(TrainConfig, read_settings(folder)["config"])
+    return from_dict(TrainConfig, read_settings(folder).config)
 
 
-def places_hash(manifest: Manifest) -> str:
-    """Identify a set of places by how it was made."""
-    towns = [(t.file, t.role, t.scans, t.submaps) for t in manifest.towns]
-    text = json.dumps([dict(manifest.settings), towns], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+def history(folder: Path) -> list[dict[str, Any]]:
+    """Return the chain of weights that the run in `folder` began with, oldest first; empty where it began anew."""
+    initial = read_settings(folder).initial
+    return list(initial["history"]) if initial else []
 
 
 def save_state(folder: Path, state: dict[str, Any]) -> None:
@@ -163,11 +198,14 @@ def machine(config: TrainConfig) -> dict[str, str]:
     }
 
 
-def metadata(config: TrainConfig, step: int, elapsed_s: float, validation: Validation) -> dict[str, str]:
+def metadata(
+    config: TrainConfig, step: int, elapsed_s: float, validation: Validation, chain: list[dict[str, Any]]
+) -> dict[str, str]:
     """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
 
-    `distances` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on the
-    held-out towns, `credibility` what the localizer makes of distances.
+    `headings` says how a query is encoded, `history` which weights the run began with (`chain`). `distances` holds the
+    quantiles of the descriptor distance to the right submap and to the nearest wrong one on the held-out towns,
+    `credibility` what the localizer makes of distances.
     """
     distances = {
         "quantiles": QUANTILES,
@@ -183,10 +221,12 @@ def metadata(config: TrainConfig, step: int, elapsed_s: float, validation: Valid
         "distances": json.dumps(distances),
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
+        "headings": str(config.headings),
+        HISTORY: json.dumps(chain),
     }
 
 
-def export(path: Path, model: CrossLoc3D, config: TrainConfig, extra: dict[str, str]) -> None:
+def export(path: Path, model: Network, config: TrainConfig, extra: dict[str, str]) -> None:
     """Write weights as float16 safetensors with model, preprocessing and `extra` inside, whole or not at all."""
     try:
         save_checkpoint(path, model, config.preprocessing, extra, dtype="float16")

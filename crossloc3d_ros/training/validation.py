@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import CalibrationConfig
 from crossloc3d_ros.evaluation.recall import chance_of_hit, wilson_share
 from crossloc3d_ros.localization.credibility import calibrate
@@ -121,17 +122,32 @@ def fit_calibration(descriptor_distances: Float64Array, metres: Float64Array) ->
     return calibrate(distances, separations_m)
 
 
-def validate(towns: Sequence[ValidationTown], encode: Callable[[list[Float32Array]], Float32Array]) -> Validation:
+def validate(
+    towns: Sequence[ValidationTown], encode: Callable[[list[Float32Array]], Float32Array], headings: int = 1
+) -> Validation:
     """Encode all queries and submaps of the held-out towns into one database and score the retrieval.
 
-    `encode` turns patches (n, 3) into descriptors (B, D).
+    `encode` turns patches (n, 3) into descriptors (B, D). With `headings` H > 1 every query, whatever its heading, is
+    encoded H times, turned by 2 pi h / H, and its distance to a submap is the least of the H.
     """
     query_places = Places(_towns([len(t.query_xy_m) for t in towns]), np.concatenate([t.query_xy_m for t in towns]))
     submap_places = Places(_towns([len(t.submap_xy_m) for t in towns]), np.concatenate([t.submap_xy_m for t in towns]))
-    queries = encode([patch for town in towns for patch in town.query_patches]).astype(np.float64)
-    submaps = encode([patch for town in towns for patch in town.submap_patches]).astype(np.float64)
-    squares = (queries**2).sum(1)[:, None] + (submaps**2).sum(1)[None, :] - 2.0 * queries @ submaps.T
-    return score(np.sqrt(np.maximum(squares, 0.0)), ground_distances(query_places, submap_places))
+    patches = [patch for town in towns for patch in town.query_patches]
+    submaps = encode([patch for town in towns for patch in town.submap_patches])
+    nearest = np.full((len(patches), len(submaps)), math.inf)
+    for heading in range(headings):
+        angle_rad = 2.0 * math.pi * heading / headings
+        queries = encode([turn(patch, angle_rad) for patch in patches] if heading else patches)
+        np.minimum(nearest, _distances(queries, submaps), out=nearest)
+    return score(nearest, ground_distances(query_places, submap_places))
+
+
+def _distances(a: Float32Array, b: Float32Array) -> Float64Array:
+    """Return the Euclidean distances (A, B) between descriptors (A, D) and (B, D)."""
+    wide_a, wide_b = a.astype(np.float64), b.astype(np.float64)
+    squares = (wide_a**2).sum(1)[:, None] + (wide_b**2).sum(1)[None, :] - 2.0 * wide_a @ wide_b.T
+    distances: Float64Array = np.sqrt(np.maximum(squares, 0.0))
+    return distances
 
 
 def _quantiles(distances: Float64Array) -> tuple[float, ...]:

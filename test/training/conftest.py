@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.patch import make_patch
+from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
 from crossloc3d_ros.training.shards import (
@@ -49,15 +49,12 @@ def boxes(rng: np.random.Generator, count: int = 14) -> Float32Array:
     return np.concatenate(parts).astype(np.float32)
 
 
-def scan_of(points: Float32Array, place: Float64Array, rng: np.random.Generator) -> Float32Array:
-    """Return some of the points around a place, turned to a random heading."""
+def scan_of(points: Float32Array, place: Float64Array, rng: np.random.Generator, heading_rad: float) -> Float32Array:
+    """Return some of the points around a place, seen along a heading."""
     around = points - np.array([*place, 0.0], np.float32)
     around = around[np.hypot(around[:, 0], around[:, 1]) < 70.0]
     around = around[rng.random(len(around)) < 0.7]
-    angle = rng.uniform(0, 2 * np.pi)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    around[:, :2] = around[:, :2] @ turn.T
-    return around.astype(np.float32)
+    return turn(around.astype(np.float32), -heading_rad)
 
 
 def training_town(seed: int, scans: int = 30) -> TrainingTown:
@@ -65,9 +62,13 @@ def training_town(seed: int, scans: int = 30) -> TrainingTown:
     rng = np.random.default_rng(seed)
     points = boxes(rng)
     places = rng.uniform(55, SIZE_M - 55, (scans, 2))
-    seen = [np.round(scan_of(points, place, rng) * 100).astype(np.int16) for place in places]
+    headings = rng.uniform(0, 2 * np.pi, scans)
+    seen = [
+        np.round(scan_of(points, place, rng, heading) * 100).astype(np.int16)
+        for place, heading in zip(places, headings, strict=True)
+    ]
     starts = np.cumsum([0, *(len(s) for s in seen)]).astype(np.int64)
-    return TrainingTown(f"town{seed}", places, np.concatenate(seen), starts, points)
+    return TrainingTown(f"town{seed}", places, headings, np.concatenate(seen), starts, points)
 
 
 def validation_town(seed: int, config: PreprocessingConfig, queries: int = 12) -> ValidationTown:
@@ -79,7 +80,7 @@ def validation_town(seed: int, config: PreprocessingConfig, queries: int = 12) -
     cut = [(c, patch.points) for c in centres if (patch := cutter.cut(c)) is not None]
     asked = []
     for place in rng.uniform(55, SIZE_M - 55, (queries, 2)):
-        patch = make_patch(scan_of(points, place, rng), config.scan_half_extent_m, config)
+        patch = make_patch(scan_of(points, place, rng, rng.uniform(0, 2 * np.pi)), config.scan_half_extent_m, config)
         if patch is not None:
             asked.append((place, patch.points))
     return ValidationTown(
@@ -103,15 +104,15 @@ def places(tmp_path: Path) -> Path:
     return write_places(tmp_path / "places")
 
 
-def write_places(folder: Path, towns: int = 4) -> Path:
+def write_places(folder: Path, towns: int = 4, first_seed: int = 0) -> Path:
     """Write made-up places."""
     folder.mkdir()
     entries = []
-    for seed in range(towns):
+    for seed in range(first_seed, first_seed + towns):
         town = training_town(seed)
         write_town(folder / f"train_{seed}.npz", town)
         entries.append(TownEntry(f"train_{seed}.npz", "train", "boxes", seed, len(town), 0, 1.0))
-    held_out = validation_town(1000, TINY_TRAINING.preprocessing)
+    held_out = validation_town(1000 + first_seed, TINY_TRAINING.preprocessing)
     write_town(folder / "validation_1000.npz", held_out)
     entries.append(
         TownEntry(
@@ -121,12 +122,18 @@ def write_places(folder: Path, towns: int = 4) -> Path:
     settings = {
         "towns": towns,
         "validation_towns": 1,
-        "seed": 0,
+        "seed": first_seed,
         "places": {},
         "preprocessing": dataclasses.asdict(TINY_TRAINING.preprocessing),
     }
     write_manifest(folder, Manifest(settings, tuple(entries)))
     return folder
+
+
+@pytest.fixture
+def make_places() -> Callable[..., Path]:
+    """Give the writer of made-up places."""
+    return write_places
 
 
 @pytest.fixture

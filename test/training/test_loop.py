@@ -14,8 +14,10 @@ from crossloc3d_ros.config import CalibrationConfig, TrainConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_checkpoint
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
-from crossloc3d_ros.training.loop import Budget, Progress, Trainer, average, export_run, learning_rate, new_state
+from crossloc3d_ros.training.loop import Progress, Trainer, export_run
+from crossloc3d_ros.training.schedule import Budget, learning_rate
 from crossloc3d_ros.training.shards import MANIFEST, read_manifest
+from crossloc3d_ros.training.state import average, new_state
 
 
 class KilledError(Exception):
@@ -32,7 +34,7 @@ def test_a_run_killed_and_resumed_ends_with_the_same_weights(places: Path, tmp_p
     config = dataclasses.replace(tiny, save_minutes=0.01)
     budget = Budget(steps=8)
     seconds = iter(float(i) for i in range(10_000))
-    Trainer(config, places, tmp_path / "straight", budget, clock=lambda: next(seconds)).run()
+    Trainer(config, [places], tmp_path / "straight", budget, clock=lambda: next(seconds)).run()
 
     def kill(progress: Progress) -> None:
         if progress.step == 6:
@@ -40,10 +42,10 @@ def test_a_run_killed_and_resumed_ends_with_the_same_weights(places: Path, tmp_p
 
     folder = tmp_path / "killed"
     with pytest.raises(KilledError):
-        Trainer(config, places, folder, budget, report=kill, clock=lambda: next(seconds)).run()
+        Trainer(config, [places], folder, budget, report=kill, clock=lambda: next(seconds)).run()
     saved = run_folder.load_state(folder)
     assert saved is not None and 0 < saved["step"] < 8
-    Trainer(config, places, folder, budget).run(resume=True)
+    Trainer(config, [places], folder, budget).run(resume=True)
 
     straight, resumed = weights(tmp_path / "straight"), weights(folder)
     assert straight.keys() == resumed.keys()
@@ -55,7 +57,7 @@ def test_learning_lowers_the_loss_and_beats_chance_on_an_unseen_town(
     places: Path, tmp_path: Path, tiny: TrainConfig
 ) -> None:
     losses: list[float] = []
-    trainer = Trainer(tiny, places, tmp_path / "run", Budget(steps=80), report=lambda p: losses.append(p.loss))
+    trainer = Trainer(tiny, [places], tmp_path / "run", Budget(steps=80), report=lambda p: losses.append(p.loss))
     recall = trainer.run().recall("R@1", 50.0)
     assert sum(losses[-5:]) < 0.75 * sum(losses[:5])
     assert recall.value > recall.chance
@@ -64,7 +66,7 @@ def test_learning_lowers_the_loss_and_beats_chance_on_an_unseen_town(
 @pytest.fixture
 def finished(places: Path, tmp_path: Path, tiny: TrainConfig) -> Path:
     folder = tmp_path / "finished"
-    trainer = Trainer(tiny, places, folder, Budget(steps=2))
+    trainer = Trainer(tiny, [places], folder, Budget(steps=2))
     trainer.run()
     trainer.write_card()
     return folder
@@ -87,7 +89,7 @@ def test_a_finished_run_leaves_weights_that_load_with_their_calibration_and_a_ca
 
 def test_a_run_is_exported_as_it_was_saved(finished: Path, tmp_path: Path, places: Path) -> None:
     output = tmp_path / "shipped" / "weights.safetensors"
-    card = export_run(finished, output, places)
+    card = export_run(finished, output, [places])
     exported, final = load_checkpoint(output), load_checkpoint(finished / run_folder.FINAL)
     for key, value in final.model.state_dict().items():
         # The norms' statistics are gathered anew, in an order that the saved averages had been through already.
@@ -97,30 +99,50 @@ def test_a_run_is_exported_as_it_was_saved(finished: Path, tmp_path: Path, place
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(finished: Path, places: Path, tiny: TrainConfig) -> None:
     with pytest.raises(TrainingError, match="--resume"):
-        Trainer(tiny, places, finished, Budget(steps=2)).run()
+        Trainer(tiny, [places], finished, Budget(steps=2)).run()
 
 
 def test_a_resumed_run_keeps_its_settings_and_its_places(finished: Path, places: Path, tiny: TrainConfig) -> None:
     other = dataclasses.replace(tiny, learning_rate=1e-4)
     with pytest.raises(TrainingError, match="'learning_rate'"):
-        Trainer(other, places, finished, Budget(steps=3)).run(resume=True)
+        Trainer(other, [places], finished, Budget(steps=3)).run(resume=True)
     manifest = json.loads((places / MANIFEST).read_text())
     manifest["settings"]["seed"] = 99
     (places / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(TrainingError, match="other places"):
-        Trainer(tiny, places, finished, Budget(steps=3)).run(resume=True)
+        Trainer(tiny, [places], finished, Budget(steps=3)).run(resume=True)
+
+
+def test_a_run_is_prolonged_by_resuming_it_with_a_larger_budget(
+    finished: Path, places: Path, tiny: TrainConfig
+) -> None:
+    Trainer(tiny, [places], finished, Budget(steps=3)).run(resume=True)
+    state = run_folder.load_state(finished)
+    assert state is not None and state["step"] == 3
+
+
+def test_a_setting_that_an_older_run_does_not_know_has_its_default(
+    finished: Path, places: Path, tiny: TrainConfig
+) -> None:
+    settings = json.loads((finished / run_folder.SETTINGS).read_text())
+    del settings["config"]["cooldown"], settings["config"]["model"]["network"], settings["initial"]
+    (finished / run_folder.SETTINGS).write_text(json.dumps(settings))
+    Trainer(tiny, [places], finished, Budget(steps=3)).run(resume=True)
+    with pytest.raises(TrainingError, match="'cooldown'"):
+        other = dataclasses.replace(tiny, cooldown=0.5)
+        Trainer(other, [places], finished, Budget(steps=4)).run(resume=True)
 
 
 def test_resuming_what_is_no_run_is_refused(places: Path, tmp_path: Path, tiny: TrainConfig) -> None:
     with pytest.raises(TrainingError, match="holds no training run"):
-        Trainer(tiny, places, tmp_path / "nothing", Budget(steps=2)).run(resume=True)
+        Trainer(tiny, [places], tmp_path / "nothing", Budget(steps=2)).run(resume=True)
 
 
 def test_a_damaged_state_is_named(finished: Path, places: Path, tiny: TrainConfig) -> None:
     state = finished / run_folder.STATE
     state.write_bytes(state.read_bytes()[:1000])
     with pytest.raises(TrainingError, match="cannot be read"):
-        Trainer(tiny, places, finished, Budget(steps=3)).run(resume=True)
+        Trainer(tiny, [places], finished, Budget(steps=3)).run(resume=True)
 
 
 def test_a_kill_or_a_full_disk_while_the_state_is_written_leaves_the_one_before(
@@ -145,7 +167,7 @@ def test_places_without_held_out_towns_are_refused(places: Path, tmp_path: Path,
     (places / MANIFEST).write_text(json.dumps(manifest))
     assert read_manifest(places).of_role("validation") == []
     with pytest.raises(TrainingError, match="no towns to validate on"):
-        Trainer(tiny, places, tmp_path / "run", Budget(steps=2)).run()
+        Trainer(tiny, [places], tmp_path / "run", Budget(steps=2)).run()
 
 
 def test_the_log_forgets_the_steps_that_a_kill_lost(finished: Path) -> None:
@@ -161,6 +183,23 @@ def test_the_learning_rate_rises_then_falls_to_its_last_share(tiny: TrainConfig)
     assert top == round(100 * tiny.warm_up) and max(rates) == pytest.approx(tiny.learning_rate)
     assert rates[:top] == sorted(rates[:top]) and rates[top:] == sorted(rates[top:], reverse=True)
     assert rates[-1] == pytest.approx(tiny.final_share * tiny.learning_rate)
+
+
+def test_until_the_cooldown_the_learning_rate_does_not_ask_how_long_the_run_will_be(tiny: TrainConfig) -> None:
+    config = dataclasses.replace(tiny, warm_up=0.0, cooldown=0.25)
+    short, long = Budget(minutes=100.0), Budget(minutes=1000.0)
+    for minute in range(0, 75, 5):
+        rates = {learning_rate(budget.share(60.0 * minute, 0), config) for budget in (short, long)}
+        assert rates == {config.learning_rate}
+    cooling = [learning_rate(short.share(60.0 * minute, 0), config) for minute in range(75, 101)]
+    assert cooling == sorted(cooling, reverse=True)
+    assert cooling[-1] == pytest.approx(config.final_share * config.learning_rate)
+
+
+def test_at_each_milestone_the_learning_rate_falls_to_a_tenth(tiny: TrainConfig) -> None:
+    config = dataclasses.replace(tiny, warm_up=0.0, milestones=(0.4, 0.6, 0.8))
+    for share, tenths in ((0.0, 0), (0.39, 0), (0.4, 1), (0.7, 2), (0.99, 3)):
+        assert learning_rate(share, config) == pytest.approx(config.learning_rate / 10**tenths)
 
 
 def test_averaged_weights_lie_between_the_old_average_and_the_model(tiny: TrainConfig) -> None:

@@ -40,7 +40,10 @@ def test_patches_stay_in_their_cube(make_training_town: Callable[..., TrainingTo
     batch = BatchSampler([make_training_town(0)], tiny).batch(0)
     for patch in batch.scans + batch.submaps:
         assert patch.shape == (tiny.preprocessing.n_points, 3) and patch.dtype == np.float32
-        assert np.abs(patch).max() <= 1.0 and patch[:, 2].min() > 0.0
+        assert patch[:, 2].min() > 0.0 and patch[:, 2].max() <= 1.0
+    assert max(np.abs(patch).max() for patch in batch.submaps) <= 1.0
+    # A scan's patch is turned as a query's is: its corners leave the cube.
+    assert max(np.hypot(patch[:, 0], patch[:, 1]).max() for patch in batch.scans) <= np.sqrt(2.0) + 1e-6
 
 
 def test_a_cut_without_turn_is_the_map_builder_s(

@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from crossloc3d_ros.training.validation import Places, ground_distances, score
+from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.training.shards import ValidationTown
+from crossloc3d_ros.training.validation import Places, ground_distances, score, validate
+from crossloc3d_ros.types import Float32Array
 
 
 def places(town: list[int], xy: list[tuple[float, float]]) -> Places:
@@ -42,3 +45,19 @@ def test_chance_is_what_random_descriptors_reach() -> None:
 def test_the_true_one_per_cent_grows_with_the_database() -> None:
     result = score(np.random.default_rng(0).random((3, 730)), np.full((3, 730), 10.0))
     assert result.recall("R@1%", 100.0).count == 8
+
+
+def test_a_query_turned_by_steps_finds_the_submap_that_a_heading_sensitive_code_gives_only_aligned() -> None:
+    rng = np.random.default_rng(3)
+    submaps = rng.uniform(-1, 1, (40, 64, 3)).astype(np.float32)
+    headings = 2 * np.pi * rng.integers(0, 8, 40) / 8
+    queries = np.stack([turn(cloud, angle) for cloud, angle in zip(submaps, headings, strict=True)])
+    xy_m = np.column_stack([500.0 * np.arange(40.0), np.zeros(40)])
+    town = ValidationTown("town", xy_m, queries, xy_m, submaps)
+
+    def encode(clouds: list[Float32Array]) -> Float32Array:
+        return np.stack([cloud[:, :2].ravel() for cloud in clouds])  # as sensitive to heading as can be
+
+    assert validate([town], encode, 8).recall("R@1", 25.0).value == 1.0
+    assert validate([town], encode, 1).recall("R@1", 25.0).value < 0.6
+    assert max(validate([town], encode, 8).true_distances) < 1e-4
