@@ -88,7 +88,8 @@ def _make_places(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from crossloc3d_ros.training.loop import Budget, Trainer
+    from crossloc3d_ros.training.loop import Trainer
+    from crossloc3d_ros.training.schedule import Budget
 
     budget = Budget(minutes=arguments.budget_minutes, steps=arguments.budget_steps)
     config = _train_config(arguments)
