@@ -36,7 +36,7 @@ class Patches(Sequence[Float32Array]):
         self._ends = np.array([len(starts) - 1])
 
     @classmethod
-    def chain(cls, parts: Iterable[Sequence[Float32Array]]) -> Patches:
+    def chain(cls, parts: Iterable[Sequence[Float32Array] | Float32Array]) -> Patches:
         """Return the patches of all parts, in order, without copying those that are `Patches` already."""
         chained = cls(np.empty((0, 3), np.float32), np.zeros(1, np.int64))
         chained._parts = [piece for part in parts for piece in as_patches(part)._parts]
@@ -142,9 +142,13 @@ class EvaluationSet:
     """Of each area."""
     families: tuple[str, ...]
     """What kind of town each area is."""
+    query_groups: tuple[str, ...] = ()
+    """Of each query, under what name it is scored separately as well; empty where there are no such groups."""
 
     def __post_init__(self) -> None:
-        """Refuse areas without a name."""
+        """Refuse areas without a name, and groups of some queries only."""
+        if self.query_groups and len(self.query_groups) != len(self.queries):
+            raise EvaluationError(f"{len(self.queries)} queries have {len(self.query_groups)} groups")
         if len(self.area_names) != len(self.families):
             raise EvaluationError(f"{len(self.area_names)} areas have {len(self.families)} families")
         for role, places in self.places().items():
@@ -159,7 +163,8 @@ class EvaluationSet:
     def fingerprint(self) -> str:
         """Return 16 hexadecimal digits that change with anything in the set but its name."""
         parts = [f"{role} {places.fingerprint()}" for role, places in self.places().items()]
-        return hashlib.sha256(json.dumps([parts, self.area_names, self.families]).encode()).hexdigest()[:16]
+        names = [self.area_names, self.families, self.query_groups]
+        return hashlib.sha256(json.dumps([parts, *names]).encode()).hexdigest()[:16]
 
 
 def join_places(parts: Sequence[PlaceSet], first_areas: Sequence[int]) -> PlaceSet:
@@ -184,6 +189,9 @@ def join_sets(name: str, parts: Sequence[EvaluationSet]) -> EvaluationSet:
         join_places([g for g, _ in grounds], [start for _, start in grounds]) if grounds else None,
         tuple(area for part in parts for area in part.area_names),
         tuple(family for part in parts for family in part.families),
+        tuple(group for part in parts for group in part.query_groups or (part.name,) * len(part.queries))
+        if any(part.query_groups for part in parts)
+        else (),
     )
 
 
@@ -210,6 +218,7 @@ def save_set(folder: Path, evaluation_set: EvaluationSet, settings: Mapping[str,
             "settings": dict(settings or {}),
             "areas": list(evaluation_set.area_names),
             "families": list(evaluation_set.families),
+            "query_groups": list(evaluation_set.query_groups),
             "places": roles,
             "bytes": {path.name: path.stat().st_size for path in sorted(partial.glob("*.npy"))},
         }
@@ -248,6 +257,7 @@ def load_set(folder: Path, *, verify: bool = False) -> EvaluationSet:
             roles.get("ground"),
             tuple(manifest["areas"]),
             tuple(manifest["families"]),
+            tuple(manifest["query_groups"]),
         )
         for role, noted in manifest["places"].items():
             if len(roles[role]) != noted["places"]:
@@ -275,7 +285,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
             raise EvaluationError(f"{path} is of format {content['format']}, this version reads {FORMAT}: make it anew")
-        for key in ("name", "settings", "areas", "families", "places", "bytes"):
+        for key in ("name", "settings", "areas", "families", "query_groups", "places", "bytes"):
             content[key]
     except FileNotFoundError as error:
         raise EvaluationError(f"{folder} holds no evaluation set") from error

@@ -35,7 +35,7 @@ def small_set(seed: int = 0, ground: bool = True) -> EvaluationSet:
     rng = np.random.default_rng(seed)
     return EvaluationSet(
         "small", places(rng, [5, 9, 1], 2), places(rng, [4] * 7, 2), places(rng, [3, 2], 2) if ground else None,
-        ("north", "south"), ("campus", "wood"),
+        ("north", "south"), ("campus", "wood"), ("held out", "seen", "seen"),
     )  # fmt: skip
 
 
@@ -55,7 +55,8 @@ def test_a_set_comes_back_from_disk(tmp_path: Path, ground: bool) -> None:
     read = load_set(tmp_path / "set", verify=True)
     for role in ("queries", "aerial", "ground"):
         assert_same(getattr(written, role), getattr(read, role))
-    assert (read.name, read.area_names, read.families) == (written.name, written.area_names, written.families)
+    for name in ("name", "area_names", "families", "query_groups"):
+        assert getattr(read, name) == getattr(written, name)
     assert read.fingerprint() == written.fingerprint()
     assert read_settings(tmp_path / "set") == {"seed": 7}
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
@@ -99,6 +100,7 @@ def test_joined_sets_number_their_areas_on() -> None:
     first, second = small_set(0), small_set(1, ground=False)
     both = join_sets("both", [first, second])
     assert both.area_names == first.area_names + second.area_names
+    assert both.query_groups == first.query_groups + second.query_groups
     np.testing.assert_array_equal(both.queries.area[3:], second.queries.area + 2)
     assert [p.tolist() for p in both.aerial.patches] == [
         p.tolist() for part in (first, second) for p in part.aerial.patches
@@ -151,3 +153,5 @@ def test_columns_that_do_not_belong_together_are_refused() -> None:
         PlaceSet(base.patches, base.area, base.xy_m * np.nan, base.heading_rad)
     with pytest.raises(EvaluationError, match="areas"):
         EvaluationSet("x", base, base, None, ("only one",), ("campus",))
+    with pytest.raises(EvaluationError, match="groups"):
+        EvaluationSet("x", base, base, None, ("one", "two"), ("campus", "wood"), ("seen",))
