@@ -35,3 +35,7 @@ class TrainingError(CrossLocError):
 
 class EvaluationError(CrossLocError):
     """An evaluation set or predictions are missing, damaged or do not belong together."""
+
+
+class DatasetError(CrossLocError):
+    """A dataset of clouds and pickles lacks files, is damaged, holds code, or cannot be made of the recordings."""
