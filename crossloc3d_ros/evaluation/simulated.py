@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import math
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from crossloc3d_ros.config import BuildConfig, MountingConfig, PreprocessingConf
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.formats.las import GROUND
 from crossloc3d_ros.places.tile import coverage, distance_to_points, ground_heights, margin_m
+from crossloc3d_ros.simulation import survey, vlp16
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import make_town
 from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
@@ -66,7 +69,7 @@ class SimulatedBenchmark:
     imu_share: float = 0.5
     """Share of the scans that an IMU levels."""
     sensor_height_m: tuple[float, float] = (0.9, 1.6)
-    survey: SurveyConfig = dataclasses.field(default_factory=SurveyConfig)
+    flight: SurveyConfig = dataclasses.field(default_factory=SurveyConfig)
     sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
     build: BuildConfig = dataclasses.field(default_factory=BuildConfig)
     """How the map's builder cuts submaps."""
@@ -122,9 +125,10 @@ SIMULATED_SMALL = SimulatedBenchmark(
 
 
 def settings_of(benchmark: SimulatedBenchmark, preprocessing: PreprocessingConfig) -> dict[str, Any]:
-    """Return everything that decides what the set holds, as plain values, with a digest of one town as it is made now.
+    """Return everything that decides what the set holds, as plain values.
 
-    Two sets with equal settings hold the same places; the digest changes when the simulator builds other towns.
+    Two sets with equal settings hold the same places: a digest of one town as it is made now changes when the
+    simulator builds other towns, and one of the sensors' sources when they see them otherwise.
     """
     probe = benchmark.towns[0]
     digests = [make_town(probe.seed, probe.family, benchmark.town_size_m, epoch).digest() for epoch in range(3)]
@@ -135,17 +139,26 @@ def settings_of(benchmark: SimulatedBenchmark, preprocessing: PreprocessingConfi
         "version": VERSION,
         "benchmark": settings,
         "preprocessing": to_dict(preprocessing),
-        "simulator": hashlib.sha256("".join(digests).encode()).hexdigest()[:16],
+        "towns": hashlib.sha256("".join(digests).encode()).hexdigest()[:16],
+        "sensors": sources_digest(vlp16, survey),
     }
+
+
+def sources_digest(*modules: ModuleType) -> str:
+    """Return 16 hexadecimal digits that change with the source of any of the modules."""
+    digest = hashlib.sha256()
+    for module in modules:
+        digest.update(inspect.getsource(module).encode())
+    return digest.hexdigest()[:16]
 
 
 def make_town_set(
     town: BenchmarkTown, benchmark: SimulatedBenchmark, preprocessing: PreprocessingConfig
 ) -> EvaluationSet:
     """Simulate one town: flown at one epoch, driven at the other, the ground database at a third; one area."""
-    flown = town.seed % 2
-    submaps = _submaps(town, flown, benchmark, preprocessing)
-    queries = _scans(town, 1 - flown, benchmark.queries, benchmark, preprocessing)
+    epoch = town.seed % 2
+    submaps = _submaps(town, epoch, benchmark, preprocessing)
+    queries = _scans(town, 1 - epoch, benchmark.queries, benchmark, preprocessing)
     ground = _scans(town, 2, benchmark.ground, benchmark, preprocessing)
     groups = (HELD_OUT if town.held_out else SEEN,) * len(queries)
     return EvaluationSet(town.name, queries, submaps, ground, (town.name,), (town.family,), groups)
@@ -156,8 +169,8 @@ def _submaps(
 ) -> PlaceSet:
     """Fly over the town and cut its submaps as the map's builder does, the terrain from the points of class ground."""
     world = make_town(town.seed, town.family, benchmark.town_size_m, epoch)
-    survey = fly(world, benchmark.survey, np.random.default_rng([town.seed, 1]))
-    cutter, centres = admitted_submaps(survey.points, survey.classification == GROUND, world, benchmark, preprocessing)
+    flown = fly(world, benchmark.flight, np.random.default_rng([town.seed, 1]))
+    cutter, centres = admitted_submaps(flown.points, flown.classification == GROUND, world, benchmark, preprocessing)
     cut = [(centre, patch.points) for centre in centres if (patch := cutter.cut(centre)) is not None]
     patches = np.array([points for _, points in cut], np.float32).reshape(-1, preprocessing.n_points, 3)
     xy_m = np.array([centre for centre, _ in cut]).reshape(-1, 2)
