@@ -69,6 +69,9 @@ class Candidates:
     """(k,) share of belief that each candidate is the place; at most 1 in all."""
     grid: Float64Array
     """(k, 3) easting, northing, ground height, metres, grid frame."""
+    heading_rad: Float64Array = field(default_factory=lambda: np.empty(0))
+    """(k,) the robot's heading that fits best, counter-clockwise from grid east, to half a step of the headings tried;
+    empty where the descriptor says nothing of it."""
 
     def __len__(self) -> int:
         return len(self.submap_ids)
@@ -161,3 +164,12 @@ class CalibratedEncoder(Protocol):
     @property
     def calibration(self) -> CalibrationConfig | None:
         """Return the calibration stored with the weights; None where there is none."""
+
+
+@runtime_checkable
+class HeadingEncoder(Protocol):
+    """An encoder whose descriptors know the heading: a query is tried in several."""
+
+    @property
+    def headings(self) -> int:
+        """Return how many, equally spaced over the circle; 1 = the heading does not matter."""

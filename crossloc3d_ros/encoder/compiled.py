@@ -7,7 +7,9 @@ tests hold the two together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, cast
 
@@ -16,7 +18,7 @@ from torch import Tensor, nn
 
 from crossloc3d_ros.encoder import stages
 from crossloc3d_ros.encoder.kernels import COLUMNS, dense_product, kernel_map, pack_weights
-from crossloc3d_ros.encoder.model import ConvolutionNorm, CrossLoc3D, Grain, RefinementLayer
+from crossloc3d_ros.encoder.model import ConvolutionNorm, CrossLoc3D, Grain, PositionEmbedding, RefinementLayer
 from crossloc3d_ros.types import Float32Array, Int32Array, Int64Array
 
 MIN_ROWS_TO_SHARE = 256
@@ -77,34 +79,49 @@ class CompiledModel:
             widths += list(config.memory_sizes)
         return all(width % COLUMNS == 0 for width in widths)
 
-    def encode(self, points: Float32Array) -> Float32Array:
+    def encode_many(self, clouds: Sequence[Float32Array]) -> Float32Array:
+        """Return the descriptors (B, D) of clouds (n, 3); with several clouds each thread takes whole ones."""
+        if len(clouds) < self._team.threads:
+            return np.stack([self.encode(cloud) for cloud in clouds])
+        alone = Team(1)
+        descriptors = np.empty((len(clouds), len(self._gating.shift)), np.float32)
+
+        def encode_some(begin: int, end: int) -> None:
+            for i in range(begin, end):
+                descriptors[i] = self.encode(clouds[i], alone)
+
+        self._team.run(self._team.ranges(len(clouds)), encode_some)
+        return descriptors
+
+    def encode(self, points: Float32Array, team: Team | None = None) -> Float32Array:
         """Return the descriptor (D,) of the points (n, 3) float32 in [-1, 1]."""
-        grains = [grain.encode(points, self._team) for grain in self._grains]
+        team = team or self._team
+        grains = [grain.encode(points, team) for grain in self._grains]
         ends = np.cumsum([len(x) for x in grains]).tolist()
         x = np.concatenate(grains)
         fused = _rows(self._fusion_shift, len(x))
         for begin, end, weights in zip([0, *ends[:-1]], ends, self._raw_fusion, strict=True):
-            self._team.share(end - begin, dense_product, x[begin:end], weights, fused[begin:end])
+            team.share(end - begin, dense_product, x[begin:end], weights, fused[begin:end])
         for number, step in enumerate(self._steps):
             grain, sub_step = divmod(number, self._sub_steps)
-            step.refine(x[: ends[grain]], self._team)
+            step.refine(x[: ends[grain]], team)
             if sub_step == self._sub_steps - 1:
-                self._team.share(ends[grain], dense_product, x, self._refined_fusion[grain], fused)
-        return self._pool(fused)
+                team.share(ends[grain], dense_product, x, self._refined_fusion[grain], fused)
+        return self._pool(fused, team)
 
-    def _pool(self, fused: Float32Array) -> Float32Array:
+    def _pool(self, fused: Float32Array, team: Team) -> Float32Array:
         n, channels = fused.shape
         soft = _rows(self._assignment.shift, n)
-        self._team.share(n, stages.assign, fused, self._assignment.weights, soft)
+        team.share(n, stages.assign, fused, self._assignment.weights, soft)
         sums = np.zeros((channels, soft.shape[1]), np.float32)
-        self._team.share(channels, stages.aggregate, fused, soft, sums)
-        y = self._project(stages.residuals(sums, soft, self._centers), self._projection)
-        gate = self._project(y, self._gating)
+        team.share(channels, stages.aggregate, fused, soft, sums)
+        y = self._project(stages.residuals(sums, soft, self._centers), self._projection, team)
+        gate = self._project(y, self._gating, team)
         return (y / (1.0 + np.exp(-gate))).astype(np.float32)
 
-    def _project(self, x: Float32Array, layer: _Layer) -> Float32Array:
-        parts = np.zeros((self._team.threads, len(layer.shift)), np.float32)
-        self._team.share(len(x), stages.project, x, layer.weights, parts, numbered=True)
+    def _project(self, x: Float32Array, layer: _Layer, team: Team) -> Float32Array:
+        parts = np.zeros((team.threads, len(layer.shift)), np.float32)
+        team.share(len(x), stages.project, x, layer.weights, parts, numbered=True)
         total: Float32Array = parts.sum(axis=0) + layer.shift
         return total
 
@@ -120,12 +137,16 @@ class Team:
         """Return on how many threads a stage of so many rows should run."""
         return self.threads if rows >= MIN_ROWS_TO_SHARE else 1
 
+    def ranges(self, rows: int, count: int | None = None) -> list[tuple[int, int]]:
+        """Return `count` equal ranges of the rows, by default one a thread."""
+        count = count or self.threads
+        bounds = [rows * part // count for part in range(count + 1)]
+        return list(itertools.pairwise(bounds))
+
     def share(self, rows: int, kernel: Callable[..., None], *args: Any, numbered: bool = False) -> None:
         """Run `kernel(*args, begin, end)` over equal ranges of the rows; `numbered` adds the range's number."""
-        count = self.parts(rows)
-        bounds = [rows * part // count for part in range(count + 1)]
-        ranges = [(bounds[part], bounds[part + 1], part) for part in range(count)]
-        self.run(ranges if numbered else [part[:2] for part in ranges], kernel, *args)
+        ranges = self.ranges(rows, self.parts(rows))
+        self.run([(*part, i) for i, part in enumerate(ranges)] if numbered else ranges, kernel, *args)
 
     def run(self, parts: list[Any], kernel: Callable[..., None], *args: Any) -> None:
         """Run `kernel(*args, *part)` for every part, the first in the calling thread; wait for all."""
@@ -148,10 +169,19 @@ class _Pairs:
         ]
 
     def convolve(
-        self, x: Float32Array, layer: _Layer, team: Team, *, relu: bool, out: Float32Array | None = None
+        self,
+        x: Float32Array,
+        layer: _Layer,
+        team: Team,
+        *,
+        relu: bool,
+        out: Float32Array | None = None,
+        added: Float32Array | None = None,
     ) -> Float32Array:
         out = np.empty((self.n_rows, len(layer.shift)), np.float32) if out is None else out
         out[:] = layer.shift
+        if added is not None:
+            out += added
         team.run(self.shares, stages.convolve, x, layer.weights, self.in_rows, self.out_rows, relu, out)
         return out
 
@@ -163,6 +193,7 @@ class _FoldedGrain:
         weights, self._stem_shift = _folded(grain.stem)
         self._stem = np.ascontiguousarray(weights[:, 0])  # (125, C)
         self._down = _layer(grain.down)
+        self._position = None if grain.position is None else _FoldedPosition(grain.position, grain.voxel_size)
         branches = [[_layer(cast(ConvolutionNorm, m)) for m in cast(nn.ModuleList, b)] for b in block.branches]
         _, self._b1, self._b2, self._b3, self._b4 = branches
         self._attention = np.stack([_array(cast(Any, a).conv.weight).reshape(3) for a in block.attentions])
@@ -185,7 +216,8 @@ class _FoldedGrain:
         coarse = stages.coarser(sites)
         fine = _rows(self._stem_shift, len(sites))
         team.share(len(sites), stages.stem, *stages.occupancy(sites, 5), self._stem, fine)
-        x = _Pairs(sites, coarse, 3, 1, team).convolve(fine, self._down, team, relu=True)
+        places = None if self._position is None else self._position.embed(coarse)
+        x = _Pairs(sites, coarse, 3, 1, team).convolve(fine, self._down, team, relu=True, added=places)
         near, far = _Pairs(coarse, coarse, 3, 2, team), _Pairs(coarse, coarse, 5, 2, team)
         branches = np.empty((5, *x.shape), np.float32)
         branches[0] = x
@@ -206,6 +238,35 @@ class _FoldedGrain:
         selected = np.empty_like(x)
         team.share(len(x), stages.select, branches, scales, *self._gate, self._kept, selected)
         return selected
+
+
+class _FoldedPosition:
+    """The embedding is a sum over the axes, and sites lie on a grid: a few sines an axis serve every site."""
+
+    def __init__(self, position: PositionEmbedding, voxel_size: float) -> None:
+        self._kind = position.kind
+        self._voxel_size = voxel_size
+        self._weights = _array(position.linear.weight).T.reshape(-1, position.axes, position.linear.out_features)
+
+    def embed(self, sites: Int32Array) -> Float32Array:
+        """Return (N, C) for sites (N, 3) of stride 2."""
+        if self._kind == "radial":
+            x, y = ((sites[:, axis] + 1.0) * self._voxel_size for axis in range(2))
+            distances, rows = np.unique(np.hypot(x, y).astype(np.float32), return_inverse=True)
+            return self._axis(distances, 0)[rows] + self._on_grid(sites[:, 2], 1)
+        return self._on_grid(sites[:, 0], 0) + self._on_grid(sites[:, 1], 1) + self._on_grid(sites[:, 2], 2)
+
+    def _on_grid(self, sites: Int32Array, axis: int) -> Float32Array:
+        low = int(sites.min())
+        centres = (np.arange(low, int(sites.max()) + 1) + 1.0) * self._voxel_size
+        table: Float32Array = self._axis(centres.astype(np.float32), axis)[sites - low]
+        return table
+
+    def _axis(self, values: Float32Array, axis: int) -> Float32Array:
+        angles = [np.float32(math.pi * wave) * values for wave in PositionEmbedding.WAVES]
+        waves = np.stack([values, *(np.sin(a) for a in angles), *(np.cos(a) for a in angles)], axis=1)
+        product: Float32Array = waves @ self._weights[:, axis]
+        return product
 
 
 class _FoldedStep:

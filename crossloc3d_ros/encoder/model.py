@@ -121,19 +121,17 @@ class PositionEmbedding(nn.Module):
     def __init__(self, kind: str, channels: int) -> None:
         super().__init__()
         self.kind = kind
-        axes = 2 if kind == "radial" else 3
-        self.linear = nn.Linear(axes * (1 + 2 * len(self.WAVES)), channels, bias=False)
+        self.axes = 2 if kind == "radial" else 3
+        self.linear = nn.Linear(self.axes * (1 + 2 * len(self.WAVES)), channels, bias=False)
         nn.init.zeros_(self.linear.weight)
 
-    def features(self, centres: Tensor) -> Tensor:
-        """Return the waves (N, F) at positions (N, 3) in patch units."""
+    def forward(self, centres: Tensor) -> Tensor:
+        """Return (N, C) for positions (N, 3) in patch units."""
         if self.kind == "radial":
             centres = torch.stack((centres[:, :2].norm(dim=1), centres[:, 2]), dim=1)
         angles = [math.pi * wave * centres for wave in self.WAVES]
-        return torch.cat((centres, *(a.sin() for a in angles), *(a.cos() for a in angles)), dim=1)
-
-    def forward(self, centres: Tensor) -> Tensor:
-        embedded: Tensor = self.linear(self.features(centres))
+        waves = torch.cat((centres, *(a.sin() for a in angles), *(a.cos() for a in angles)), dim=1)
+        embedded: Tensor = self.linear(waves)
         return embedded
 
 

@@ -18,6 +18,7 @@ from crossloc3d_ros.types import Float32Array
 
 MAX_THREADS = 4
 """More threads than this gain nothing for a single cloud."""
+MAX_HEADINGS = 64
 
 
 class Encoder:
@@ -43,6 +44,7 @@ class Encoder:
         self._fingerprint = fingerprint
         self.metadata = dict(metadata or {})
         self._calibration = _calibration(self.metadata)
+        self._headings = _headings(self.metadata)
 
     @property
     def fingerprint(self) -> str:
@@ -65,6 +67,14 @@ class Encoder:
         return self._calibration
 
     @property
+    def headings(self) -> int:
+        """Return in how many headings a query must be tried against submaps that look north; 1 = the heading is free.
+
+        Stored with the weights, because they were trained for it.
+        """
+        return self._headings
+
+    @property
     def descriptor_size(self) -> int:
         """Numbers in a descriptor."""
         return self._model.config.descriptor_size
@@ -81,7 +91,7 @@ class Encoder:
                 raise CloudError(f"a patch must be an array (n, 3) with n > 0, got {cloud.shape}")
         arrays = [np.ascontiguousarray(cloud, np.float32) for cloud in clouds]
         if self._compiled is not None:
-            return np.stack([self._compiled.encode(array) for array in arrays])
+            return self._compiled.encode_many(arrays)
         with torch.no_grad():
             tensors = [torch.from_numpy(array).to(self._device) for array in arrays]
             result: Float32Array = self._model(tensors).cpu().numpy()
@@ -100,3 +110,10 @@ def _calibration(metadata: Mapping[str, str]) -> CalibrationConfig | None:
         return from_dict(CalibrationConfig, json.loads(metadata["credibility"]))
     except (json.JSONDecodeError, AttributeError, ConfigError) as error:
         raise CheckpointError(f"the calibration in the weights cannot be used ({error}); export them again") from error
+
+
+def _headings(metadata: Mapping[str, str]) -> int:
+    text = metadata.get("headings", "1")
+    if not text.isdecimal() or not 1 <= int(text) <= MAX_HEADINGS:
+        raise CheckpointError(f"the weights ask for {text!r} headings, not for 1 to {MAX_HEADINGS}; export them again")
+    return int(text)

@@ -9,7 +9,7 @@ import numpy as np
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.localization.credibility import effective_calibration, judge
-from crossloc3d_ros.localization.retrieval import retrieve
+from crossloc3d_ros.localization.retrieval import encode_query, retrieve
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import (
     Candidates,
@@ -47,9 +47,9 @@ class Localizer:
         if prepared.patch is None:
             timings = Timings(prepare_ms=1e3 * (prepared_at - started))
             return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts, timings)
-        descriptor = self.encoder.encode(prepared.patch.points)
+        descriptors = encode_query(self.encoder, prepared.patch.points)
         encoded_at = time.perf_counter()
-        candidates = retrieve(descriptor, self.aerial_map, self.config.top_k, self.calibration)
+        candidates = retrieve(descriptors, self.aerial_map, self.config.top_k, self.calibration)
         frame = self.aerial_map.frame
         belief = judge(candidates, frame.to_enu(candidates.grid), self.config.credibility)
         grid = frame.from_enu(belief.enu[None])

@@ -1,19 +1,70 @@
-"""From a descriptor to the places in the aerial map that look like it."""
+"""From a patch to the places in the aerial map that look like it."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
+from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import CalibrationConfig
 from crossloc3d_ros.localization.credibility import candidate_probabilities
+from crossloc3d_ros.places.descriptor_map import DescriptorMap
 from crossloc3d_ros.places.store import AerialMap
-from crossloc3d_ros.types import Candidates, Float32Array
+from crossloc3d_ros.types import (
+    Candidates,
+    DescriptorEncoder,
+    Float32Array,
+    Float64Array,
+    HeadingEncoder,
+    Int64Array,
+)
 
 
-def retrieve(descriptor: Float32Array, aerial_map: AerialMap, top_k: int, calibration: CalibrationConfig) -> Candidates:
-    """Return the `top_k` submaps, fewer on a small map, that look most like `descriptor` (D,), best first."""
-    submap_ids, distances = aerial_map.index.search(descriptor, top_k)
+def headings_of(encoder: DescriptorEncoder) -> int:
+    """Return in how many headings a query is tried with this encoder."""
+    return encoder.headings if isinstance(encoder, HeadingEncoder) else 1
+
+
+def heading_angles(headings: int) -> Float64Array:
+    """Return (H,) the headings that are tried, radians counter-clockwise from grid east, evenly over the circle."""
+    return 2.0 * math.pi * np.arange(headings) / headings
+
+
+def encode_query(encoder: DescriptorEncoder, points: Float32Array) -> Float32Array:
+    """Return the descriptors (H, D) of a patch (n, 3) as if the robot had each of the headings: submaps look north."""
+    headings = headings_of(encoder)
+    if headings == 1:
+        return encoder.encode(points)[None]
+    return encoder.encode_batch([turn(points, float(angle)) for angle in heading_angles(headings)])
+
+
+def search_headings(
+    index: DescriptorMap, descriptors: Float32Array, k: int
+) -> tuple[Int64Array, Float32Array, Int64Array]:
+    """Return ids, distances and heading numbers (k,) of the submaps nearest to any of the descriptors (H, D)."""
+    ids, distances = index.search_many(descriptors, k)
+    order = np.argsort(distances, axis=None, kind="stable")
+    flat = ids.reshape(-1)[order]
+    # A submap counts once, where it is nearest; `first` keeps the order of the distances.
+    first = np.sort(np.unique(flat, return_index=True)[1])[:k]
+    best = order[first]
+    return flat[first], distances.reshape(-1)[best], best // ids.shape[1]
+
+
+def retrieve(
+    descriptors: Float32Array, aerial_map: AerialMap, top_k: int, calibration: CalibrationConfig
+) -> Candidates:
+    """Return the `top_k` submaps, fewer on a small map, that look most like a query, best first.
+
+    `descriptors` (H, D) are those of `encode_query`; a submap is as near as the nearest of them.
+    """
+    submap_ids, distances, numbers = search_headings(aerial_map.index, descriptors, top_k)
+    headings = len(descriptors)
     return Candidates(
         submap_ids=submap_ids,
         descriptor_distances=distances,
         probabilities=candidate_probabilities(distances, calibration),
         grid=aerial_map.submaps.grid[submap_ids],
+        heading_rad=heading_angles(headings)[numbers] if headings > 1 else np.empty(0),
     )
