@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import pytest
 from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
+from crossloc3d_ros.training.loop import Trainer
+from crossloc3d_ros.training.schedule import Budget
 from crossloc3d_ros.training.shards import (
     Manifest,
     TownEntry,
@@ -25,8 +28,8 @@ from crossloc3d_ros.types import Float32Array, Float64Array
 SIZE_M = 220.0
 
 TINY = ModelConfig(
-    voxel_sizes=(0.1, 0.4), channels=16, sub_steps=1, memory_sizes=(16, 16), fused_channels=32, clusters=8,
-    descriptor_size=32,
+    voxel_sizes=(0.12, 0.4), kept_branches=0, channels=16, sub_steps=1, memory_sizes=(16, 16), fused_channels=32,
+    clusters=8, descriptor_size=32,
 )  # fmt: skip
 TINY_TRAINING = TrainConfig(
     pairs=6,
@@ -98,10 +101,31 @@ def tiny() -> TrainConfig:
     return TINY_TRAINING
 
 
+@pytest.fixture(scope="session")
+def made_places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make the places once."""
+    return write_places(tmp_path_factory.mktemp("made") / "places")
+
+
 @pytest.fixture
-def places(tmp_path: Path) -> Path:
-    """Give a folder of made-up places: four towns to learn from, one to validate on."""
-    return write_places(tmp_path / "places")
+def places(made_places: Path, tmp_path: Path) -> Path:
+    """Give a folder of made-up places to change at will: four towns to learn from, one to validate on."""
+    return shutil.copytree(made_places, tmp_path / "places")
+
+
+@pytest.fixture(scope="session")
+def finished_run(made_places: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Train once, two steps."""
+    trainer = Trainer(TINY_TRAINING, [made_places], tmp_path_factory.mktemp("run") / "finished", Budget(steps=2))
+    trainer.run()
+    trainer.write_card()
+    return trainer.folder
+
+
+@pytest.fixture
+def finished(finished_run: Path, tmp_path: Path) -> Path:
+    """Give the folder of a finished run, to change at will."""
+    return shutil.copytree(finished_run, tmp_path / "finished")
 
 
 def write_places(folder: Path, towns: int = 4, first_seed: int = 0) -> Path:

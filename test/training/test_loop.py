@@ -63,15 +63,6 @@ def test_learning_lowers_the_loss_and_beats_chance_on_an_unseen_town(
     assert recall.value > recall.chance
 
 
-@pytest.fixture
-def finished(places: Path, tmp_path: Path, tiny: TrainConfig) -> Path:
-    folder = tmp_path / "finished"
-    trainer = Trainer(tiny, [places], folder, Budget(steps=2))
-    trainer.run()
-    trainer.write_card()
-    return folder
-
-
 def test_a_finished_run_leaves_weights_that_load_with_their_calibration_and_a_card(
     finished: Path, tiny: TrainConfig
 ) -> None:
