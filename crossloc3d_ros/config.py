@@ -156,7 +156,7 @@ class BuildConfig:
 class PlacesConfig:
     """Simulated towns to learn from."""
 
-    families: tuple[str, ...] = option((), "kinds of towns, taken in turns; empty = all that the simulator knows")
+    families: tuple[str, ...] = option((), "kinds of towns, taken in turns; empty = all but those held out")
     town_size_m: float = option(400.0, "side of a town", low=200.0, high=2000.0)
     scans: int = option(120, "scans of each town to learn from", low=1, high=100_000)
     validation_scans: int = option(40, "scans of each town to validate on", low=1, high=100_000)
@@ -166,6 +166,7 @@ class PlacesConfig:
     sensor_height_m: tuple[float, float] = option((0.9, 1.6), "lowest and highest lidar above the ground", low=0.2)
     tilt_deg: float = option(1.0, "standard deviation of roll and pitch, added to the slope's", low=0.0, high=15.0)
     imu_share: float = option(0.5, "share of the scans that an IMU levels", low=0.0, high=1.0)
+    surface_share: float = option(0.0, "share of the training scans cast in a surveyed surface", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,27 @@ class TrainConfig:
     log_steps: int = option(10, "batches between two lines of the log", low=1, high=100_000)
     model: ModelConfig = field(default_factory=ModelConfig, metadata={"text": "the network"})
     preprocessing: PreprocessingConfig = field(default_factory=PreprocessingConfig, metadata={"text": "the patch"})
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """From recordings with GNSS and a survey to a dataset in the layout of CS-Campus3D."""
+
+    max_gnss_std_m: float = option(10.0, "a scan whose GNSS deviates by more (one sigma) is left out", low=0.01)
+    max_gap_s: float = option(2.5, "between fixes farther apart in time no position is interpolated", low=0.01)
+    scan_spacing_m: float = option(5.0, "a scan nearer to the last one used is left out", low=0.0, high=1000.0)
+    positive_m: float = option(25.0, "clouds so near show the same place", low=1.0, high=1000.0)
+    negative_m: float = option(100.0, "clouds farther apart show different places", low=1.0, high=10_000.0)
+    hit_m: float = option(100.0, "a submap so near to a test scan is a right answer", low=1.0, high=1000.0)
+    validation_share: float = option(0.1, "share of the scans that the validation area should have", low=0.0, high=0.9)
+    test_share: float = option(0.2, "share of the scans that the test area should have", low=0.0, high=0.9)
+
+    def __post_init__(self) -> None:
+        """Refuse what leaves nothing to learn from."""
+        if self.validation_share + self.test_share >= 1.0:
+            raise ConfigError("'validation_share' and 'test_share' together must leave something to learn from")
+        if self.negative_m < self.positive_m:
+            raise ConfigError(f"'negative_m' ({self.negative_m}) must not be below 'positive_m' ({self.positive_m})")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

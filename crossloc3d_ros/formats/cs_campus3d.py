@@ -300,8 +300,9 @@ def write_queries(path: Path, subsets: Sequence[QueryTable]) -> None:
     for subset in subsets:
         entries = {}
         for row, neighbours in enumerate(subset.neighbours):
-            right = {int(m): [int(i) for i in rows] for m, rows in neighbours.items()}
-            entries[row] = {"query": subset.clouds.files[row], **_place(subset.clouds, row), **right}
+            entry: dict[Any, Any] = {"query": subset.clouds.files[row], **_place(subset.clouds, row)}
+            entry.update((int(m), [int(i) for i in rows]) for m, rows in neighbours.items())
+            entries[row] = entry
         content.append(entries)
     _write_whole(path, lambda file: pickle.dump(content, file, protocol=2))
 
