@@ -6,6 +6,7 @@ set may be larger than the memory.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -119,6 +120,10 @@ class PlaceSet:
 
     def fingerprint(self) -> str:
         """Return 16 hexadecimal digits that change with any point, position, heading and area."""
+        return self._fingerprint
+
+    @functools.cached_property
+    def _fingerprint(self) -> str:
         patches = as_patches(self.patches)
         digest = hashlib.sha256()
         for column, kind in ((self.area, "<i8"), (self.xy_m, "<f8"), (self.heading_rad, "<f8")):
