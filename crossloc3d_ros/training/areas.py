@@ -1,0 +1,112 @@
+"""Areas to learn from, to validate and to test on: no two of them see a square metre in common."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from crossloc3d_ros.clouds.raster import Bounds
+from crossloc3d_ros.errors import DatasetError
+from crossloc3d_ros.types import Float64Array
+
+TRAINING, VALIDATION, TEST = "train", "validation", "test"
+NONE = ""
+"""The role of what lies across a border: it would see two areas."""
+
+Roles = npt.NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Areas:
+    """Rectangles to validate and to test on; everything else is to learn from."""
+
+    boxes: tuple[tuple[str, Bounds], ...]
+    """Role and west, south, east, north in metres; infinite where there is no border."""
+
+    def __post_init__(self) -> None:
+        """Refuse rectangles that are none or that overlap."""
+        for role, (west, south, east, north) in self.boxes:
+            if role not in (VALIDATION, TEST) or not (west < east and south < north):
+                raise DatasetError(
+                    f"the {role} area {(west, south, east, north)} is no rectangle west, south, east, north"
+                )
+        for (first, a), (second, b) in itertools.combinations(self.boxes, 2):
+            if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]:
+                raise DatasetError(f"the {first} area {a} and the {second} area {b} overlap")
+
+    def roles(self, xy_m: Float64Array, reach_m: float) -> Roles:
+        """Return the role (N,) of places (N, 2) that see the square of `reach_m` around them; '' across a border."""
+        roles = np.full(len(xy_m), TRAINING, dtype="<U10")
+        low, high = xy_m - reach_m, xy_m + reach_m
+        for role, (west, south, east, north) in self.boxes:
+            corner, opposite = np.array([west, south]), np.array([east, north])
+            inside = ((low >= corner) & (high <= opposite)).all(axis=1)
+            touching = ((high > corner) & (low < opposite)).all(axis=1)
+            roles[touching] = NONE
+            roles[inside] = role
+        return roles
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Return the rectangles for JSON, null where there is no border."""
+        return [
+            {"role": role, "west_south_east_north": [v if math.isfinite(v) else None for v in box]}
+            for role, box in self.boxes
+        ]
+
+
+def cut_areas(xy_m: Float64Array, reach_m: float, shares: Mapping[str, float]) -> Areas:
+    """Return areas that lie side by side, with about `shares` of the scans (N, 2), each seeing `reach_m` around it.
+
+    The borders run north-south or east-west, in the order of areas that leaves the fewest scans across a border. Raises
+    DatasetError where every cut leaves an area without a scan.
+    """
+    wanted = [role for role in (TRAINING, VALIDATION, TEST) if shares.get(role, 0.0) > 0.0]
+    best: tuple[int, Areas] | None = None
+    for axis, order in itertools.product((0, 1), itertools.permutations(wanted)):
+        areas = _side_by_side(xy_m, axis, order, shares)
+        if areas is None:
+            continue
+        roles = areas.roles(xy_m, reach_m)
+        if any(not (roles == role).any() for role in wanted):
+            continue
+        kept = int((roles != NONE).sum())
+        if best is None or kept > best[0]:
+            best = kept, areas
+    if best is None:
+        extent = np.ptp(xy_m, axis=0) if len(xy_m) else np.zeros(2)
+        raise DatasetError(
+            f"{len(xy_m):,} scans over {extent[0]:.0f} x {extent[1]:.0f} m cannot be split into areas to "
+            f"{_and(wanted)} that are {2 * reach_m:.0f} m apart: record more, give a share of 0 to an area that is not "
+            "needed, or name the areas"
+        )
+    return best[1]
+
+
+def _side_by_side(xy_m: Float64Array, axis: int, order: Sequence[str], shares: Mapping[str, float]) -> Areas | None:
+    total = sum(shares[role] for role in order)
+    along = np.sort(xy_m[:, axis])
+    borders = [-math.inf]
+    share = 0.0
+    for role in order[:-1]:
+        share += shares[role] / total
+        borders.append(round(float(np.quantile(along, share)), 1) if len(along) else 0.0)
+    borders.append(math.inf)
+    boxes = []
+    for role, low, high in zip(order, borders[:-1], borders[1:], strict=True):
+        if not low < high:
+            return None
+        if role != TRAINING:
+            box = (low, -math.inf, high, math.inf) if axis == 0 else (-math.inf, low, math.inf, high)
+            boxes.append((role, box))
+    return Areas(tuple(boxes))
+
+
+def _and(roles: Sequence[str]) -> str:
+    names = {TRAINING: "learn from", VALIDATION: "validate on", TEST: "test on"}
+    return " and ".join(names[role] for role in roles)
