@@ -21,6 +21,7 @@ COMMANDS = [
     "demo",
     "import_checkpoint",
     "localizer",
+    "make_dataset",
     "replay",
     "simulate",
     "train",
