@@ -5,7 +5,7 @@ cannot be answered and are left out of that radius, their number is reported.
 
 What an interval means: queries of one town are alike, so towns are the independent pieces of evidence, not queries.
 Each interval is that of a bootstrap that draws whole towns with replacement (2,000 times, fixed seed, percentiles 2.5
-and 97.5). Where fewer than eight towns were asked, squares of 100 m inside of them take their place. A bootstrap of few
+and 97.5). Where fewer than eight towns were asked, squares of 50 m inside of them take their place. A bootstrap of few
 and lucky towns is too narrow, at 0 and 100 % it has no width at all: the interval is widened to hold Wilson's for as
 many trials as there are places at least 25 m apart.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from crossloc3d_ros.evaluation.predictions import About, Predictions, database_of, metres_of, one_per_cent
-from crossloc3d_ros.evaluation.recall import Share, independent_places, wilson_share
+from crossloc3d_ros.evaluation.recall import Share, hits, independent_places, wilson_share
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array
 
@@ -33,7 +33,7 @@ PUBLISHED_ONE_PER_CENT = 25
 _RESAMPLED = 2000
 _SEED = 12_345
 _LEAST_CLUSTERS = 8
-_BLOCK_M = 100.0
+_BLOCK_M = 50.0
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def chance_curve(within: Int64Array, database: int, ranks: int) -> Float64Array:
 
 
 def clusters_of(queries: PlaceSet) -> Int64Array:
-    """Return (Q,) which independent piece of evidence each query belongs to: its area, or a square of 100 m in it."""
+    """Return (Q,) which independent piece of evidence each query belongs to: its area, or a square of 50 m in it."""
     areas = np.unique(queries.area)
     if len(areas) >= _LEAST_CLUSTERS:
         return np.searchsorted(areas, queries.area).astype(np.int64)
@@ -198,9 +198,9 @@ def difference(
     if one.about.setting != other.about.setting:
         raise ValueError(f"settings differ: {one.about.setting} and {other.about.setting}")
     queries, database = evaluation_set.queries, database_of(evaluation_set, one.about.setting)
-    hits = [(metres_of(each, evaluation_set)[:, :rank] <= radius_m).any(axis=1) for each in (one, other)]
-    counted = places_within(queries, database, radius_m) > 0
-    ahead = hits[0][counted].astype(np.float64) - hits[1][counted]
+    counted = np.asarray(places_within(queries, database, radius_m) > 0, dtype=np.bool_)
+    hit, other_hit = (hits(metres_of(each, evaluation_set)[counted], rank, radius_m) for each in (one, other))
+    ahead = hit.astype(np.float64) - other_hit
     if len(ahead) == 0:
         return Share(float("nan"), -1.0, 1.0)
     low, high = _bootstrap(ahead, clusters_of(_chosen(queries, counted)))
