@@ -107,7 +107,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     missing, unknown = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
     if missing or unknown:
         raise CheckpointError(
-            f"{path} does not fit its own configuration: missing {missing[:3]}, unknown {unknown[:3]}"
+            f"{path} does not fit its own configuration of a network '{config.network}': "
+            f"missing {missing[:3]}, unknown {unknown[:3]}"
         )
     for key, tensor in state.items():
         if tensor.shape != expected[key].shape:

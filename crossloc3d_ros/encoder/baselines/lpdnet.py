@@ -64,6 +64,12 @@ class LpdNet(Network):
 
     def forward(self, clouds: Sequence[Tensor] | Tensor) -> Tensor:
         """Return the descriptors (B, D) of clouds (B, n, 3), or of B clouds (n_i, 3) of any sizes."""
+        if self.training:
+            return self._describe(clouds)
+        # One at a time: a product's last digits depend on its size, and they may decide who is whose neighbour.
+        return torch.cat([self._describe(clouds[i : i + 1]) for i in range(len(clouds))])
+
+    def _describe(self, clouds: Sequence[Tensor] | Tensor) -> Tensor:
         thinned = [voxel_means(cloud, self.config.voxel_sizes[0]) for cloud in clouds]
         counts = [len(cloud) for cloud in thinned]
         with torch.no_grad():

@@ -76,7 +76,8 @@ class PointVlad(nn.Module):
     def forward(self, x: Tensor, counts: list[int]) -> Tensor:
         directions = F.normalize(self.layers(x), dim=1, eps=1e-12)
         starts = torch.cumsum(torch.tensor([0, *counts]), 0)
-        return self.length * F.normalize(self.pooling(directions, starts), dim=1, eps=1e-12)
+        descriptors: Tensor = self.length * F.normalize(self.pooling(directions, starts), dim=1, eps=1e-12)
+        return descriptors
 
 
 class PointNetVlad(Network):
