@@ -168,8 +168,12 @@ class CalibratedEncoder(Protocol):
 
 @runtime_checkable
 class HeadingEncoder(Protocol):
-    """An encoder whose descriptors know the heading: a query is tried in several."""
+    """An encoder that says how a query's unknown heading is dealt with."""
 
     @property
     def headings(self) -> int:
-        """Return how many, equally spaced over the circle; 1 = the heading does not matter."""
+        """Return in how many headings, evenly over the circle, a query is tried; 1 = the descriptor is free of it."""
+
+    @property
+    def turns(self) -> int:
+        """Return over how many turns, evenly over the circle, the descriptor of a heading is averaged; 1 = none."""

@@ -44,7 +44,8 @@ class Encoder:
         self._fingerprint = fingerprint
         self.metadata = dict(metadata or {})
         self._calibration = _calibration(self.metadata)
-        self._headings = _headings(self.metadata)
+        self._headings = _count(self.metadata, "headings")
+        self._turns = _count(self.metadata, "turns")
 
     @property
     def fingerprint(self) -> str:
@@ -73,6 +74,15 @@ class Encoder:
         Stored with the weights, because they were trained for it.
         """
         return self._headings
+
+    @property
+    def turns(self) -> int:
+        """Return over how many turns a query's descriptor is averaged, where the heading is free.
+
+        What has learned not to mind the heading minds it a little: the mean over some turns minds it less. Stored
+        with the weights, because the calibration is that of the averaged descriptors.
+        """
+        return self._turns
 
     @property
     def descriptor_size(self) -> int:
@@ -112,8 +122,8 @@ def _calibration(metadata: Mapping[str, str]) -> CalibrationConfig | None:
         raise CheckpointError(f"the calibration in the weights cannot be used ({error}); export them again") from error
 
 
-def _headings(metadata: Mapping[str, str]) -> int:
-    text = metadata.get("headings", "1")
+def _count(metadata: Mapping[str, str], key: str) -> int:
+    text = metadata.get(key, "1")
     if not text.isdecimal() or not 1 <= int(text) <= MAX_HEADINGS:
-        raise CheckpointError(f"the weights ask for {text!r} headings, not for 1 to {MAX_HEADINGS}; export them again")
+        raise CheckpointError(f"the weights ask for {text!r} {key}, not for 1 to {MAX_HEADINGS}; export them again")
     return int(text)

@@ -21,22 +21,23 @@ from crossloc3d_ros.types import (
 )
 
 
-def headings_of(encoder: DescriptorEncoder) -> int:
-    """Return in how many headings a query is tried with this encoder."""
-    return encoder.headings if isinstance(encoder, HeadingEncoder) else 1
-
-
-def heading_angles(headings: int) -> Float64Array:
-    """Return (H,) the headings that are tried, radians counter-clockwise from grid east, evenly over the circle."""
-    return 2.0 * math.pi * np.arange(headings) / headings
+def heading_angles(count: int) -> Float64Array:
+    """Return (count,) angles in radians, counter-clockwise from 0, evenly over the circle."""
+    return 2.0 * math.pi * np.arange(count) / count
 
 
 def encode_query(encoder: DescriptorEncoder, points: Float32Array) -> Float32Array:
-    """Return the descriptors (H, D) of a patch (n, 3) as if the robot had each of the headings: submaps look north."""
-    headings = headings_of(encoder)
-    if headings == 1:
+    """Return the descriptors (H, D) under which the place of a patch (n, 3) may be found on the map.
+
+    One of each heading that the robot may have, where the encoder knows headings: submaps look north. One alone,
+    averaged over the encoder's turns, where it does not.
+    """
+    headings, turns = (encoder.headings, encoder.turns) if isinstance(encoder, HeadingEncoder) else (1, 1)
+    if headings * turns == 1:
         return encoder.encode(points)[None]
-    return encoder.encode_batch([turn(points, float(angle)) for angle in heading_angles(headings)])
+    count = headings if headings > 1 else turns
+    descriptors = encoder.encode_batch([turn(points, float(angle)) for angle in heading_angles(count)])
+    return descriptors if headings > 1 else descriptors.mean(axis=0, keepdims=True)
 
 
 def search_headings(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.clouds.patch import turn
-from crossloc3d_ros.localization.retrieval import encode_query, heading_angles, headings_of, search_headings
+from crossloc3d_ros.localization.retrieval import encode_query, heading_angles, search_headings
 from crossloc3d_ros.places.descriptor_map import DescriptorMap
 from crossloc3d_ros.types import Float32Array
 
@@ -19,8 +19,9 @@ class Compass:
     fingerprint = "compass"
     descriptor_size = 3
 
-    def __init__(self, headings: int) -> None:
+    def __init__(self, headings: int, turns: int = 1) -> None:
         self.headings = headings
+        self.turns = turns
 
     def encode(self, points: Float32Array) -> Float32Array:
         mean: Float32Array = points.mean(axis=0)
@@ -41,8 +42,17 @@ def _patch(rng: np.random.Generator) -> Float32Array:
 
 def test_encoder_without_headings_is_asked_once() -> None:
     patch = _patch(np.random.default_rng(0))
-    assert headings_of(Plain()) == 1  # type: ignore[arg-type]
-    assert encode_query(Plain(), patch).shape == (1, 3)  # type: ignore[arg-type]
+    descriptors = encode_query(Plain(), patch)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(descriptors, Plain().encode(patch)[None])
+
+
+def test_mean_over_turns_takes_the_heading_out() -> None:
+    patch = _patch(np.random.default_rng(3))
+    encoder = Compass(1, turns=4)
+    first, second = (encode_query(encoder, turn(patch, angle)) for angle in (0.0, math.pi / 2))  # type: ignore[arg-type]
+    np.testing.assert_allclose(first, second, atol=1e-6)
+    np.testing.assert_allclose(first[0, :2], 0.0, atol=1e-6)
+    assert first.shape == (1, 3)
 
 
 @pytest.mark.parametrize("true_number", [0, 3, 7])
