@@ -12,21 +12,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.gradients import batch_loss, tensors
 from crossloc3d_ros.training.initial import Initial, read_initial, take_over
 from crossloc3d_ros.training.loss import InfoNCE
 from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.memory import keep_freed_memory
+from crossloc3d_ros.training.mining import mine
 from crossloc3d_ros.training.model_card import model_card
-from crossloc3d_ros.training.sampling import BatchSampler
+from crossloc3d_ros.training.sampling import BatchSampler, HardPlaces
 from crossloc3d_ros.training.schedule import Budget, learning_rate
 from crossloc3d_ros.training.shards import ValidationTown, write_text
-from crossloc3d_ros.training.state import RunState, average, new_state
+from crossloc3d_ros.training.state import RunState, average, grow_batches, new_state
 from crossloc3d_ros.training.validation import Validation, validate
 from crossloc3d_ros.types import Float32Array
 
@@ -118,10 +120,12 @@ class Trainer:
         config = self.config
         started = self.clock() - state.elapsed_s
         last_saved = last_logged = state.elapsed_s
-        logged_step = state.step
+        logged_clouds = state.clouds
         losses: list[float] = []
         bad_steps = 0
         while (share := self.budget.share(state.elapsed_s, state.step)) < 1.0:
+            if config.hard_share > 0.0 and state.step > 0 and state.step % config.mine_steps == 0:
+                state.hard = self._mine(state, sampler, log)
             rate = learning_rate(share, config)
             loss = take_step(state, sampler, rate, config)
             if math.isfinite(loss):
@@ -131,22 +135,22 @@ class Trainer:
                 bad_steps += 1
                 if bad_steps >= _MOST_BAD_STEPS:
                     raise TrainingError(f"the loss was not finite {bad_steps} times in a row; lower the learning rate")
-            state.step += 1
             state.elapsed_s = self.clock() - started
 
             if state.step % config.log_steps == 0:
                 seconds = max(state.elapsed_s - last_logged, 1e-9)
-                samples = 2 * config.pairs * (state.step - logged_step) / seconds
+                samples = (state.clouds - logged_clouds) / seconds
                 mean = float(np.mean(losses)) if losses else math.nan
                 used = max(self.budget.share(state.elapsed_s, state.step), 1e-9)
                 remaining = state.elapsed_s * (1.0 / used - 1.0)
                 self.report(Progress(state.step, used, mean, rate, samples, max(0.0, remaining)))
                 log.write(
                     "step", step=state.step, elapsed_s=round(state.elapsed_s, 1), loss=round(mean, 5), rate=rate,
-                    samples_per_s=round(samples, 2), scale=_scale(state.criterion),
+                    samples_per_s=round(samples, 2), clouds=state.clouds, pairs=state.pairs,
+                    scale=_scale(state.criterion),
                 )  # fmt: skip
                 losses.clear()
-                last_logged, logged_step = state.elapsed_s, state.step
+                last_logged, logged_clouds = state.elapsed_s, state.clouds
             if state.elapsed_s - state.last_validation_s >= 60.0 * config.validation_minutes:
                 state.last_validation_s = state.elapsed_s
                 averaged = with_fresh_norms(state.averaged, sampler, config)
@@ -159,10 +163,17 @@ class Trainer:
                     run_folder.export(self.folder / run_folder.BEST, averaged, config, metadata)
                 self.report(Progress(state.step, share, loss, rate, 0.0, 0.0, validation))
                 state.elapsed_s = self.clock() - started
-                last_logged, logged_step = state.elapsed_s, state.step
+                last_logged, logged_clouds = state.elapsed_s, state.clouds
             if state.elapsed_s - last_saved >= 60.0 * config.save_minutes:
                 last_saved = state.elapsed_s
                 run_folder.save_state(self.folder, state.to_dict())
+
+    def _mine(self, state: RunState, sampler: BatchSampler, log: run_folder.Log) -> HardPlaces:
+        began = time.monotonic()
+        model = with_fresh_norms(state.averaged, sampler, self.config)
+        hard = mine(sampler, lambda clouds: encode(model, clouds, self.config.device), self.config, state.step)
+        log.write("mining", step=state.step, places=len(hard.town), seconds=round(time.monotonic() - began, 1))
+        return hard
 
     def _validate(
         self, state: RunState, held_out: Sequence[ValidationTown], log: run_folder.Log, model: Network
@@ -211,35 +222,35 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
 
 def take_step(state: RunState, sampler: BatchSampler, rate: float, config: TrainConfig) -> float:
     """Learn from one batch and return its loss; weights stay as they are where it is not finite."""
-    batch = sampler.batch(state.step)
+    batch = sampler.batch(state.step, pairs=state.pairs, hard=state.hard)
     for group in state.optimizer.param_groups:
         group["lr"] = rate
-    descriptors = state.model(_tensors([*batch.scans, *batch.submaps], config.device))
-    ignored = torch.from_numpy(batch.ignored).to(config.device)
-    loss: Tensor = state.criterion(descriptors[: config.pairs], descriptors[config.pairs :], ignored)
     state.optimizer.zero_grad(set_to_none=True)
-    if not torch.isfinite(loss):
-        return loss.item()
-    loss.backward()  # type: ignore[no-untyped-call]
-    norm = nn.utils.clip_grad_norm_(state.model.parameters(), config.clip_norm or math.inf)
-    if torch.isfinite(norm):
-        state.optimizer.step()
-        average(state.averaged, state.model, min(config.ema_decay, (1.0 + state.step) / (10.0 + state.step)))
-    return loss.item()
+    loss = batch_loss(state.model, state.loss, batch, config).item()
+    if math.isfinite(loss):
+        norm = nn.utils.clip_grad_norm_(state.model.parameters(), config.clip_norm or math.inf)
+        if torch.isfinite(norm):
+            state.optimizer.step()
+            average(state.averaged, state.model, min(config.ema_decay, (1.0 + state.step) / (10.0 + state.step)))
+    state.step += 1
+    state.clouds += 2 * len(batch.scans)
+    grow_batches(state, config)
+    return loss
 
 
 @torch.no_grad()
 def with_fresh_norms(model: Network, sampler: BatchSampler, config: TrainConfig) -> Network:
     """Return a copy whose batch norms hold the statistics of its own weights, not an average of older ones'."""
     fresh = copy.deepcopy(model).train()
-    norms = [module for module in fresh.modules() if isinstance(module, nn.BatchNorm1d)]
+    norms = [module for module in fresh.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # a plain mean over the batches
+    pairs = min(config.pairs, config.chunk_pairs or config.pairs)
     for i in range(_NORM_BATCHES):
-        batch = sampler.batch(_NORM_STEP + i)
-        fresh(_tensors([*batch.scans, *batch.submaps], config.device))
+        batch = sampler.batch(_NORM_STEP + i, pairs=pairs)
+        fresh(tensors([*batch.scans, *batch.submaps], config.device))
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
     return fresh.eval()
@@ -249,14 +260,10 @@ def with_fresh_norms(model: Network, sampler: BatchSampler, config: TrainConfig)
 def encode(model: Network, clouds: Sequence[Float32Array], device: str) -> Float32Array:
     """Return the descriptors (B, D) of patches."""
     parts = [
-        model(_tensors(clouds[i : i + _ENCODE_BATCH], device)).float().cpu().numpy()
+        model(tensors(clouds[i : i + _ENCODE_BATCH], device)).float().cpu().numpy()
         for i in range(0, len(clouds), _ENCODE_BATCH)
     ]
     return np.concatenate(parts)
-
-
-def _tensors(clouds: Sequence[Float32Array], device: str) -> list[Tensor]:
-    return [torch.from_numpy(cloud).to(device) for cloud in clouds]
 
 
 def _scale(criterion: nn.Module) -> float | None:

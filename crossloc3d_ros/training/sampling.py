@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,11 +13,14 @@ from numba import njit
 from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.training.augmentation import occlude, paper_batch, paper_cloud
 from crossloc3d_ros.training.shards import TrainingTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 _CELL_M = 10.0
 _ATTEMPTS = 60
+_HARD_GROUP = 4
+"""Places of a batch that were taken for each other."""
 _HEADING_MARGIN = 1.25
 """How far beyond half the step between two headings the weights learn to follow."""
 
@@ -31,6 +35,28 @@ class Batch:
     """P patches (n, 3); row i belongs to scan i."""
     ignored: BoolArray
     """(P, P) scan i and submap j of one town, too near to call different and not the same; False on the diagonal."""
+    matches: BoolArray
+    """(P, P) scan i and submap j that belong together; True on the diagonal."""
+
+
+@dataclass(frozen=True, eq=False)
+class HardPlaces:
+    """Places that weights take for each other."""
+
+    town: Int64Array
+    """(N,) index of the town."""
+    scan: Int64Array
+    """(N,) index of the scan in it, which is where the place is."""
+    neighbours: Int64Array
+    """(N, K) rows of the places with the nearest descriptors, all of them elsewhere."""
+
+
+class _Wish(NamedTuple):
+    """A place that a pair is wanted of."""
+
+    town: int
+    scan: int
+    heading_rad: float
 
 
 class PointField:
@@ -74,50 +100,95 @@ class BatchSampler:
         self._fields = [PointField(town.survey_points) for town in self._towns]
         self._config = config
 
-    def batch(self, step: int) -> Batch:
-        """Return the batch of a step, the same at every call."""
-        rng = np.random.default_rng((self._config.seed, step))
+    @property
+    def places(self) -> tuple[Int64Array, Int64Array, Float64Array]:
+        """Return town (N,), scan (N,) and position (N, 2), town frame, of all places to learn from."""
+        counts = [len(town) for town in self._towns]
+        towns = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+        scans = np.concatenate([np.arange(count, dtype=np.int64) for count in counts])
+        return towns, scans, np.concatenate([town.scan_xy_m for town in self._towns])
+
+    def submap(self, town: int, scan: int) -> Float32Array | None:
+        """Return the patch (n, 3) of the submap centred where a scan was taken, or None where there is too little."""
+        preprocessing = self._config.preprocessing
+        points = self._fields[town].cut(self._towns[town].scan_xy_m[scan], 0.0, preprocessing.half_extent_m)
+        patch = make_patch(points, preprocessing.half_extent_m, preprocessing)
+        return None if patch is None else patch.points
+
+    def batch(self, step: int, *, pairs: int = 0, hard: HardPlaces | None = None) -> Batch:
+        """Return the batch of a step, the same at every call with the same arguments.
+
+        `pairs`: how many, by default as configured. With `hard` a share of them comes from groups of places that
+        were taken for each other.
+        """
         config = self._config
-        drawn = min(config.towns_a_batch, len(self._towns), config.pairs)
+        rng = np.random.default_rng((config.seed, step))
+        pairs = pairs or config.pairs
+        wanted = self._hard_places(rng, round(config.hard_share * pairs), hard) if hard is not None else []
+        drawn = min(config.towns_a_batch, len(self._towns), pairs)
         chosen = rng.choice(len(self._towns), drawn, replace=False)
+        towns = np.concatenate(
+            [chosen[np.sort(np.arange(pairs - len(wanted)) % drawn)], [place.town for place in wanted]]
+        ).astype(np.int64)
         scans: list[Float32Array] = []
         submaps: list[Float32Array] = []
-        owners = np.sort(np.arange(config.pairs) % drawn)
-        places = np.empty((config.pairs, 2))
-        centres = np.empty((config.pairs, 2))
-        for i, owner in enumerate(owners):
-            town = int(chosen[owner])
-            scan, submap, places[i], centres[i] = self._pair(town, rng, places[:i][owners[:i] == owner])
+        places = np.empty((pairs, 2))
+        centres = np.empty((pairs, 2))
+        for i, town in enumerate(towns.tolist()):
+            wish = wanted[i - pairs] if i >= pairs - len(wanted) else None
+            scan, submap, places[i], centres[i] = self._pair(town, rng, places[:i][towns[:i] == town], wish)
             scans.append(scan)
             submaps.append(submap)
+        if config.augmentation == "paper":
+            scans, submaps = paper_batch((scans, submaps), rng)
         apart = np.hypot(*(places[:, None] - centres[None]).transpose(2, 0, 1))
-        ignored = (owners[:, None] == owners[None, :]) & (apart < config.neighbour_m)
-        np.fill_diagonal(ignored, False)
-        return Batch(scans, submaps, ignored)
+        same_town = towns[:, None] == towns[None, :]
+        matches = same_town & (apart < config.match_m)
+        np.fill_diagonal(matches, True)
+        return Batch(scans, submaps, same_town & (apart < config.neighbour_m) & ~matches, matches)
+
+    def _hard_places(self, rng: np.random.Generator, count: int, hard: HardPlaces) -> list[_Wish]:
+        """Return `count` places in groups of such as are taken for each other; a group is seen along one heading."""
+        wanted: list[_Wish] = []
+        while len(wanted) < count:
+            row = int(rng.integers(len(hard.town)))
+            others = rng.permutation(hard.neighbours[row])[: _HARD_GROUP - 1]
+            heading = float(rng.uniform(0.0, 2.0 * math.pi))
+            wanted += [_Wish(int(hard.town[r]), int(hard.scan[r]), heading) for r in (row, *others)]
+        return wanted[:count]
 
     def _pair(
-        self, town_index: int, rng: np.random.Generator, taken: Float64Array
+        self, town_index: int, rng: np.random.Generator, taken: Float64Array, wish: _Wish | None
     ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array]:
         """Return a scan, a submap that it lies in, the scan's place and the submap's centre.
 
-        The place is not yet among those `taken`, and with probability `near_share` it is near one of them.
+        The place is the one wished for, or one not yet among those `taken`, and then with probability `near_share`
+        near one of them.
         """
         town, field, config = self._towns[town_index], self._fields[town_index], self._config
         preprocessing = config.preprocessing
         wish_near = len(taken) > 0 and rng.random() < config.near_share
         for attempt in range(_ATTEMPTS):
-            index = int(rng.integers(len(town)))
+            wished = wish is not None and attempt == 0
+            index = wish.scan if wish is not None and wished else int(rng.integers(len(town)))
             place = town.scan_xy_m[index]
             nearest_m = float(np.hypot(*(taken - place).T).min()) if len(taken) else math.inf
             far_enough = nearest_m >= config.neighbour_m
-            as_wished = far_enough and (not wish_near or nearest_m <= config.near_m)
-            if (not as_wished and attempt < _ATTEMPTS // 2) or (not far_enough and attempt < 3 * _ATTEMPTS // 4):
+            near_enough = far_enough and (not wish_near or nearest_m <= config.near_m)
+            if not wished and (
+                (not near_enough and attempt < _ATTEMPTS // 2) or (not far_enough and attempt < 3 * _ATTEMPTS // 4)
+            ):
+                continue
+            if config.augmentation == "paper":
+                pair = self._paper_pair(town, field, index, rng)
+                if pair is not None:
+                    return pair
                 continue
             scan = make_patch(
-                _augment(town.scan_points(index), rng, config), preprocessing.scan_half_extent_m, preprocessing
+                occlude(town.scan_points(index), rng, config), preprocessing.scan_half_extent_m, preprocessing
             )
-            centre = place + rng.uniform(-config.offset_m, config.offset_m, 2)
-            heading = float(rng.uniform(0.0, 2.0 * math.pi))
+            centre = self._centre(place, rng)
+            heading = wish.heading_rad if wish is not None else float(rng.uniform(0.0, 2.0 * math.pi))
             submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
             mirrored = bool(rng.integers(2))
             if mirrored:
@@ -137,15 +208,23 @@ class BatchSampler:
             f"{preprocessing.min_points} points; lower min_points or make other places"
         )
 
+    def _paper_pair(
+        self, town: TrainingTown, field: PointField, index: int, rng: np.random.Generator
+    ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array] | None:
+        """Return what `_pair` does, by the published recipe: the scan along the robot, the submap to the north."""
+        preprocessing = self._config.preprocessing
+        place = town.scan_xy_m[index]
+        centre = self._centre(place, rng)
+        points = field.cut(centre, 0.0, preprocessing.half_extent_m)
+        scan = make_patch(town.scan_points(index), preprocessing.scan_half_extent_m, preprocessing)
+        submap = make_patch(points, preprocessing.half_extent_m, preprocessing)
+        if scan is None or submap is None:
+            return None
+        return paper_cloud(scan.points, rng), paper_cloud(submap.points, rng), place, centre
 
-def _augment(points: Float32Array, rng: np.random.Generator, config: TrainConfig) -> Float32Array:
-    """Return a copy without some of the points: dropouts, and at times a sector that something large blocks."""
-    kept = rng.random(len(points)) < rng.uniform(config.keep_points, 1.0)
-    if rng.random() < config.sector_share:
-        bearing = np.arctan2(points[:, 1], points[:, 0])
-        width = rng.uniform(0.0, math.pi / 2.0)
-        kept &= np.mod(bearing - rng.uniform(0.0, 2.0 * math.pi), 2.0 * math.pi) >= width
-    return points[kept]
+    def _centre(self, place: Float64Array, rng: np.random.Generator) -> Float64Array:
+        """Return the centre (2,) of a submap that a place lies in."""
+        return place + rng.uniform(-self._config.offset_m, self._config.offset_m, 2)
 
 
 @njit(cache=True, nogil=True)

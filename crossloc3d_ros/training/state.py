@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -13,7 +13,8 @@ from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.networks import make_network
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.training.loss import BatchHardTriplet, InfoNCE
+from crossloc3d_ros.training.loss import BatchHardTriplet, Criterion, InfoNCE, TruncatedSmoothAP
+from crossloc3d_ros.training.sampling import HardPlaces
 
 
 @dataclass
@@ -24,10 +25,23 @@ class RunState:
     averaged: Network
     criterion: nn.Module
     optimizer: torch.optim.Optimizer
+    pairs: int
+    """Pairs in a batch, by now."""
     step: int = 0
+    clouds: int = 0
+    """Clouds learned from."""
     elapsed_s: float = 0.0
     best_recall: float = -1.0
     last_validation_s: float = 0.0
+    active_share: float = 0.0
+    """Sum of the shares of active triplets since the batches last grew or did not."""
+    hard: HardPlaces | None = None
+    """What the last search for confused places found."""
+
+    @property
+    def loss(self) -> Criterion:
+        """The criterion as a function."""
+        return cast(Criterion, self.criterion)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the state as what `torch.load(weights_only=True)` reads back."""
@@ -40,8 +54,13 @@ class RunState:
             "elapsed_s": self.elapsed_s,
             "best_recall": self.best_recall,
             "last_validation_s": self.last_validation_s,
+            "pairs": self.pairs,
+            "clouds": self.clouds,
+            "active_share": self.active_share,
             "torch_rng": torch.get_rng_state(),
         }
+        if self.hard is not None:
+            content["hard"] = {key: torch.from_numpy(value) for key, value in vars(self.hard).items()}
         if torch.cuda.is_available():
             content["cuda_rng"] = torch.cuda.get_rng_state()
         return content
@@ -57,6 +76,11 @@ class RunState:
             self.elapsed_s = content["elapsed_s"]
             self.best_recall = content["best_recall"]
             self.last_validation_s = content["last_validation_s"]
+            self.pairs = content.get("pairs", self.pairs)  # the next three came later
+            self.clouds = content.get("clouds", 2 * self.pairs * self.step)
+            self.active_share = content.get("active_share", 0.0)
+            if "hard" in content:
+                self.hard = HardPlaces(**{key: value.numpy() for key, value in content["hard"].items()})
             torch.set_rng_state(content["torch_rng"])
             if "cuda_rng" in content and torch.cuda.is_available():
                 torch.cuda.set_rng_state(content["cuda_rng"])
@@ -70,14 +94,34 @@ def new_state(config: TrainConfig) -> RunState:
     torch.manual_seed(config.seed)
     model = make_network(config.model).to(config.device).train()
     averaged = copy.deepcopy(model).eval().requires_grad_(False)
-    criterion = (InfoNCE() if config.loss == "info_nce" else BatchHardTriplet(config.margin)).to(config.device)
+    criterion = make_criterion(config).to(config.device)
     matrices = [p for p in model.parameters() if p.ndim > 1]
     others = [p for p in model.parameters() if p.ndim <= 1]
     groups = [
         {"params": matrices, "weight_decay": config.weight_decay},
         {"params": [*others, *criterion.parameters()], "weight_decay": 0.0},
     ]
-    return RunState(model, averaged, criterion, torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99)))
+    optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, config.beta2))
+    return RunState(model, averaged, criterion, optimizer, config.pairs)
+
+
+def make_criterion(config: TrainConfig) -> nn.Module:
+    """Return the loss that the configuration names."""
+    if config.loss == "smooth_ap":
+        return TruncatedSmoothAP(config.temperature, config.positives)
+    return InfoNCE() if config.loss == "info_nce" else BatchHardTriplet(config.margin)
+
+
+def grow_batches(state: RunState, config: TrainConfig) -> None:
+    """Enlarge the batches where the last ones had too few active triplets; call it after every step."""
+    if not config.most_pairs or not isinstance(state.criterion, BatchHardTriplet):
+        return
+    if state.criterion.active_share is not None:
+        state.active_share += float(state.criterion.active_share)
+    if state.step % config.growth_steps == 0:
+        if state.active_share / config.growth_steps < config.growth_below:
+            state.pairs = min(int(state.pairs * config.growth), config.most_pairs)
+        state.active_share = 0.0
 
 
 @torch.no_grad()

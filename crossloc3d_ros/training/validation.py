@@ -138,11 +138,11 @@ def validate(
     for heading in range(headings):
         angle_rad = 2.0 * math.pi * heading / headings
         queries = encode([turn(patch, angle_rad) for patch in patches] if heading else patches)
-        np.minimum(nearest, _distances(queries, submaps), out=nearest)
+        np.minimum(nearest, euclidean_distances(queries, submaps), out=nearest)
     return score(nearest, ground_distances(query_places, submap_places))
 
 
-def _distances(a: Float32Array, b: Float32Array) -> Float64Array:
+def euclidean_distances(a: Float32Array, b: Float32Array) -> Float64Array:
     """Return the Euclidean distances (A, B) between descriptors (A, D) and (B, D)."""
     wide_a, wide_b = a.astype(np.float64), b.astype(np.float64)
     squares = (wide_a**2).sum(1)[:, None] + (wide_b**2).sum(1)[None, :] - 2.0 * wide_a @ wide_b.T

@@ -5,19 +5,23 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import yaml
 
 from crossloc3d_ros.cli import train
-from crossloc3d_ros.config import CalibrationConfig, TrainConfig, from_dict
+from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PlacesConfig, TrainConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_checkpoint
-from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.errors import ConfigError, TrainingError
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loop import Progress, Trainer, export_run
 from crossloc3d_ros.training.schedule import Budget, learning_rate
 from crossloc3d_ros.training.shards import MANIFEST, read_manifest
 from crossloc3d_ros.training.state import average, new_state
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 class KilledError(Exception):
@@ -30,8 +34,19 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return {**{f"m.{k}": v for k, v in state["model"].items()}, **{f"a.{k}": v for k, v in state["averaged"].items()}}
 
 
-def test_a_run_killed_and_resumed_ends_with_the_same_weights(places: Path, tmp_path: Path, tiny: TrainConfig) -> None:
-    config = dataclasses.replace(tiny, save_minutes=0.01)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"loss": "smooth_ap", "chunk_pairs": 4, "hard_share": 0.5, "mine_steps": 2, "mined_places": 40},
+        {"loss": "batch_hard", "augmentation": "paper", "most_pairs": 12, "growth_steps": 2, "growth_below": 1.0},
+    ],
+    ids=["plain", "average precision, chunks, hard places", "the paper's, growing"],
+)
+def test_a_run_killed_and_resumed_ends_with_the_same_weights(
+    places: Path, tmp_path: Path, tiny: TrainConfig, settings: dict[str, Any]
+) -> None:
+    config = dataclasses.replace(tiny, save_minutes=0.01, **settings)
     budget = Budget(steps=8)
     seconds = iter(float(i) for i in range(10_000))
     Trainer(config, [places], tmp_path / "straight", budget, clock=lambda: next(seconds)).run()
@@ -47,6 +62,8 @@ def test_a_run_killed_and_resumed_ends_with_the_same_weights(places: Path, tmp_p
     assert saved is not None and 0 < saved["step"] < 8
     Trainer(config, [places], folder, budget).run(resume=True)
 
+    logged = [entry for entry in run_folder.read_log(folder) if entry["kind"] == "step"]
+    assert (logged[-1]["pairs"] > tiny.pairs) == ("most_pairs" in settings)
     straight, resumed = weights(tmp_path / "straight"), weights(folder)
     assert straight.keys() == resumed.keys()
     for key, value in straight.items():
@@ -191,6 +208,29 @@ def test_at_each_milestone_the_learning_rate_falls_to_a_tenth(tiny: TrainConfig)
     config = dataclasses.replace(tiny, warm_up=0.0, milestones=(0.4, 0.6, 0.8))
     for share, tenths in ((0.0, 0), (0.39, 0), (0.4, 1), (0.7, 2), (0.99, 3)):
         assert learning_rate(share, config) == pytest.approx(config.learning_rate / 10**tenths)
+
+
+@pytest.mark.parametrize("name", ["train.yaml", "train_paper.yaml"])
+def test_the_settings_that_ship_can_be_read(name: str) -> None:
+    document = yaml.safe_load((REPOSITORY / "config" / name).read_text())
+    config = from_dict(TrainConfig, document["train"])
+    from_dict(PlacesConfig, document["places"])
+    assert config.model == ModelConfig() or name == "train.yaml"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"most_pairs": 64},
+        {"most_pairs": 8, "loss": "batch_hard"},
+        {"milestones": (0.6, 0.4)},
+        {"precision": "bfloat16"},
+        {"augmentation": "paper", "headings": 8},
+    ],
+)
+def test_settings_that_do_not_fit_each_other_are_refused(settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        TrainConfig(**settings)
 
 
 def test_averaged_weights_lie_between_the_old_average_and_the_model(tiny: TrainConfig) -> None:
