@@ -39,6 +39,8 @@ _NAMES = {
     ("numpy.core.numeric", "_frombuffer"): "buffer",
     ("numpy._core.numeric", "_frombuffer"): "buffer",
     ("_codecs", "encode"): "encode",  # how protocols 0 to 2 write bytes
+    ("builtins", "bytes"): "bytes",  # and no bytes at all
+    ("__builtin__", "bytes"): "bytes",
     ("builtins", "set"): "set",
     ("__builtin__", "set"): "set",
     ("builtins", "frozenset"): "frozenset",
@@ -297,6 +299,8 @@ class _Machine:
             return kind.read(raw, shape, order)
         if meaning == "encode" and arguments[1:] in (("latin1",), ("latin-1",)):
             return arguments[0].encode("latin-1")
+        if meaning == "bytes" and arguments == ():
+            return b""
         if meaning in ("set", "frozenset") and len(arguments) <= 1:
             content = arguments[0] if arguments else ()
             items = content.tolist() if isinstance(content, np.ndarray) else list(content)

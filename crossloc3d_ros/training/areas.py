@@ -19,6 +19,8 @@ TRAINING, VALIDATION, TEST = "train", "validation", "test"
 NONE = ""
 """The role of what lies across a border: it would see two areas."""
 
+_BORDER_SHARES = np.linspace(0.025, 0.975, 39)
+
 Roles = npt.NDArray[np.str_]
 
 
@@ -63,47 +65,45 @@ class Areas:
 def cut_areas(xy_m: Float64Array, reach_m: float, shares: Mapping[str, float]) -> Areas:
     """Return areas that lie side by side, with about `shares` of the scans (N, 2), each seeing `reach_m` around it.
 
-    The borders run north-south or east-west, in the order of areas that leaves the fewest scans across a border. Raises
-    DatasetError where every cut leaves an area without a scan.
+    The borders run north-south or east-west, in the order of areas and at the places that leave the area that comes off
+    worst the most of its share, and then the fewest scans across a border. Raises DatasetError where every cut leaves
+    an area without a scan.
     """
     wanted = [role for role in (TRAINING, VALIDATION, TEST) if shares.get(role, 0.0) > 0.0]
-    best: tuple[int, Areas] | None = None
-    for axis, order in itertools.product((0, 1), itertools.permutations(wanted)):
-        areas = _side_by_side(xy_m, axis, order, shares)
-        if areas is None:
-            continue
-        roles = areas.roles(xy_m, reach_m)
-        if any(not (roles == role).any() for role in wanted):
-            continue
-        kept = int((roles != NONE).sum())
-        if best is None or kept > best[0]:
-            best = kept, areas
-    if best is None:
+    best: tuple[float, int] = (0.0, 0)
+    chosen: Areas | None = None
+    for axis in (0, 1):
+        along = xy_m[:, axis]
+        places = np.unique(np.round(np.quantile(along, _BORDER_SHARES), 1)) if len(along) else np.empty(0)
+        for order in itertools.permutations(wanted):
+            for inner in itertools.combinations(places.tolist(), len(order) - 1):
+                borders = (-math.inf, *inner, math.inf)
+                counts = [
+                    int(((along - reach_m >= low) & (along + reach_m <= high)).sum())
+                    for low, high in itertools.pairwise(borders)
+                ]
+                fullness = min(
+                    min(1.0, count / (shares[role] * len(along))) if count else 0.0
+                    for role, count in zip(order, counts, strict=True)
+                )
+                if fullness > 0.0 and (round(fullness, 2), sum(counts)) > best:
+                    best = round(fullness, 2), sum(counts)
+                    chosen = _side_by_side(axis, order, borders)
+    if chosen is None:
         extent = np.ptp(xy_m, axis=0) if len(xy_m) else np.zeros(2)
         raise DatasetError(
             f"{len(xy_m):,} scans over {extent[0]:.0f} x {extent[1]:.0f} m cannot be split into areas to "
             f"{_and(wanted)} that are {2 * reach_m:.0f} m apart: record more, give a share of 0 to an area that is not "
             "needed, or name the areas"
         )
-    return best[1]
+    return chosen
 
 
-def _side_by_side(xy_m: Float64Array, axis: int, order: Sequence[str], shares: Mapping[str, float]) -> Areas | None:
-    total = sum(shares[role] for role in order)
-    along = np.sort(xy_m[:, axis])
-    borders = [-math.inf]
-    share = 0.0
-    for role in order[:-1]:
-        share += shares[role] / total
-        borders.append(round(float(np.quantile(along, share)), 1) if len(along) else 0.0)
-    borders.append(math.inf)
-    boxes = []
+def _side_by_side(axis: int, order: Sequence[str], borders: Sequence[float]) -> Areas:
+    boxes: list[tuple[str, Bounds]] = []
     for role, low, high in zip(order, borders[:-1], borders[1:], strict=True):
-        if not low < high:
-            return None
         if role != TRAINING:
-            box = (low, -math.inf, high, math.inf) if axis == 0 else (-math.inf, low, math.inf, high)
-            boxes.append((role, box))
+            boxes.append((role, (low, -math.inf, high, math.inf) if axis == 0 else (-math.inf, low, math.inf, high)))
     return Areas(tuple(boxes))
 
 
