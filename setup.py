@@ -19,6 +19,7 @@ COMMANDS = [
     "build_map",
     "cut_survey",
     "demo",
+    "evaluate",
     "import_checkpoint",
     "localizer",
     "make_dataset",

@@ -10,7 +10,6 @@ import dataclasses
 import io
 import json
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,7 +22,7 @@ from crossloc3d_ros.evaluation.encoding import EncodingJob, OwnDistance, encode_
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet, join_places
 from crossloc3d_ros.localization.retrieval import heading_angles
 from crossloc3d_ros.places.descriptor_map import DescriptorMap
-from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
+from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array, HeadingEncoder, Int64Array
 
 Setting = Literal["aerial", "aerial+ground"]
 HeadingMode = Literal["aligned", "random"]
@@ -98,6 +97,16 @@ class Plan:
         for count in self.query_headings:
             if not 1 <= count <= 360:
                 raise ConfigError(f"'query_headings' must lie between 1 and 360, got {count}")
+
+
+def way_of(encoder: DescriptorEncoder) -> tuple[int, Way]:
+    """Return in how many headings the localizer tries a query with an encoder, and what it makes of them."""
+    if isinstance(encoder, HeadingEncoder):
+        if encoder.headings > 1:
+            return encoder.headings, "nearest"
+        if encoder.turns > 1:
+            return encoder.turns, "mean"
+    return 1, "nearest"
 
 
 def database_of(evaluation_set: EvaluationSet, setting: Setting) -> PlaceSet:
@@ -295,8 +304,3 @@ def metres_of(predictions: Predictions, evaluation_set: EvaluationSet) -> Float6
     metres = np.hypot(offsets[..., 0], offsets[..., 1])
     metres[database.area[ids] != queries.area[:, None]] = np.inf
     return np.asarray(metres)
-
-
-def names_of(predictions: Sequence[Predictions]) -> list[str]:
-    """Return the files' names under which predictions of one method and benchmark are kept."""
-    return [f"{each.about.name}.npz" for each in predictions]

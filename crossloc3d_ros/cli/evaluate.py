@@ -1,0 +1,260 @@
+"""`evaluate`: measure weights by the paper's protocol, on a fixed benchmark or on a dataset of one's own."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import functools
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
+from crossloc3d_ros.cli.demo import find_surveys
+from crossloc3d_ros.cli.replay import own_version
+from crossloc3d_ros.encoder.checkpoint import load_encoder
+from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
+from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, write_page
+from crossloc3d_ros.evaluation.encoding import EncodingJob
+from crossloc3d_ros.evaluation.estimates import write_atomically
+from crossloc3d_ros.evaluation.gallery import gallery
+from crossloc3d_ros.evaluation.predictions import (
+    HEADING_MODES,
+    SETTINGS,
+    Plan,
+    Predictions,
+    load_predictions,
+    predict_all,
+    save_predictions,
+    way_of,
+)
+from crossloc3d_ros.evaluation.published import load_evaluation_set
+from crossloc3d_ros.evaluation.results import as_csv, as_json, headline
+from crossloc3d_ros.evaluation.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
+from crossloc3d_ros.evaluation.sets import EvaluationSet
+from crossloc3d_ros.types import DescriptorEncoder
+
+PAGE, CSV, JSON, PREDICTIONS = "index.html", "results.csv", "results.json", "predictions"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    arguments = _parser().parse_args(argv)
+    return run(lambda: _evaluate(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="evaluate",
+        description="Ask weights for the places of ground scans in a database of aerial submaps, write what they "
+        "answer, and score it: recall at 100, 50 and 25 m with chance and interval, curves, pictures, one HTML page. "
+        "A run that was stopped goes on where it was.",
+    )
+    parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--benchmark", choices=list(BENCHMARKS), default="simulated", help="(default: %(default)s)")
+    source.add_argument("--dataset", type=Path, help="folder in the layout of CS-Campus3D, as make_dataset writes it")
+    parser.add_argument(
+        "--preset", choices=["campus", "oxford", "plain"], help="kind of --dataset (default: by its files)"
+    )
+    parser.add_argument(
+        "--setting", nargs="+", choices=SETTINGS, help="databases searched (default: all that the benchmark has)"
+    )
+    parser.add_argument(
+        "--heading", nargs="+", choices=HEADING_MODES, default=list(HEADING_MODES),
+        help="queries turned to north, or as the robot stood (default: both)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--query-headings", nargs="+", type=int, metavar="N",
+        help="try each query of unknown heading in so many headings; several numbers are compared (default: as many "
+        "as the weights were trained for)",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK)")
+    parser.add_argument(
+        "--data", type=Path, default=Path("out/benchmark"),
+        help="folder in which benchmarks and descriptors are kept (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--surveys", type=Path, help="folder of the two Amsterdam surveys (default: maps/amsterdam)")
+    parser.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
+    parser.add_argument("--device", default="cpu", help="where the encoder runs: cpu or cuda (default: %(default)s)")
+    parser.add_argument(
+        "--only-score", action="store_true", help="score the predictions that lie in --output; nothing is encoded"
+    )
+    add_verbosity(parser)
+    return parser
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    target = console()
+    set_up_logging(arguments.verbose, target)
+    if arguments.workers < 1:
+        raise EvaluationError(f"--workers must be at least 1, got {arguments.workers}")
+    encoder = load_encoder(arguments.weights, arguments.device)
+    with ProgressDisplay(target) as display:
+        evaluation_set = _open(arguments, encoder, display)
+    output: Path = arguments.output or Path("out/evaluate") / evaluation_set.name.replace(" ", "_")
+    if not arguments.only_score:
+        with ProgressDisplay(target) as display:
+            _predict(arguments, encoder, evaluation_set, output, display)
+    predictions = _read_predictions(output / PREDICTIONS)
+    scores = [score(each, evaluation_set) for each in predictions]
+    main_scores = headline(scores, *way_of(encoder))
+    main_predictions = predictions[scores.index(main_scores)]
+    write_atomically(output / CSV, as_csv(scores))
+    write_atomically(output / JSON, as_json(scores))
+    pictures = gallery(main_predictions, evaluation_set, encoder.preprocessing.half_extent_m)
+    write_page(output / PAGE, scores, main_scores, pictures, _texts(arguments, encoder, evaluation_set, main_scores))
+    results = Console(highlight=False)
+    for table in tables(scores, main_scores):
+        results.print(table)
+    print(f"{output / CSV}\n{output / JSON}\n{output / PAGE}   (open it in a browser)")
+
+
+def _open(arguments: argparse.Namespace, encoder: DescriptorEncoder, display: ProgressDisplay) -> EvaluationSet:
+    if arguments.dataset is not None:
+        return load_evaluation_set(arguments.dataset, encoder.preprocessing, arguments.preset)
+    surveys = find_surveys(arguments.surveys) if arguments.benchmark == "amsterdam" else None
+    return open_benchmark(
+        arguments.benchmark,
+        arguments.data,
+        encoder.preprocessing,
+        workers=arguments.workers,
+        surveys=surveys,
+        progress=display,
+    )
+
+
+def _predict(
+    arguments: argparse.Namespace,
+    encoder: DescriptorEncoder,
+    evaluation_set: EvaluationSet,
+    output: Path,
+    display: ProgressDisplay,
+) -> None:
+    possible = SETTINGS if evaluation_set.ground is not None else SETTINGS[:1]
+    count, way = way_of(encoder)
+    plan = Plan(
+        settings=tuple(arguments.setting or possible),
+        headings=tuple(arguments.heading),
+        query_headings=tuple(arguments.query_headings or [count]),
+        invariant=count == 1 or way == "mean",
+    )
+    job = EncodingJob(
+        encoder,
+        functools.partial(load_encoder, arguments.weights, arguments.device, threads=1),
+        arguments.data / "descriptors",
+        arguments.workers,
+        display,
+    )
+    made = predict_all(evaluation_set, job, plan, _label(arguments))
+    folder = output / PREDICTIONS
+    for before in folder.glob("*.npz"):
+        before.unlink()
+    for predictions in made:
+        save_predictions(folder / f"{predictions.about.name}.npz", predictions)
+
+
+def _read_predictions(folder: Path) -> list[Predictions]:
+    found = [load_predictions(path) for path in sorted(folder.glob("*.npz"))]
+    if not found:
+        raise EvaluationError(f"{folder} holds no predictions: run the command without --only-score first")
+    # Aerial before aerial+ground, aligned before random, few headings before many.
+    order = [*SETTINGS, *HEADING_MODES]
+    return sorted(
+        found,
+        key=lambda p: (order.index(p.about.setting), order.index(p.about.heading), p.about.query_headings, p.about.way),
+    )
+
+
+def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
+    """Return what the terminal shows: a table a radius, and the main scores divided by group and family."""
+    shown = []
+    for radius in RADII_M:
+        figures = [figure for figure in main_scores.overall.figures if figure.radius_m == radius]
+        names = [f"{figure.label}*" if figure.rank == PUBLISHED_ONE_PER_CENT else figure.label for figure in figures]
+        table = _table(f"Within {radius:g} m, %", ["", names[0], "95 %", "by lot", *names[1:]])
+        for each in scores:
+            first, *others = (each.overall.figure(figure.label, radius) for figure in figures)
+            table.add_row(
+                describe(each.about),
+                _percent(first.share.value),
+                f"{100 * first.share.low:.0f}–{100 * first.share.high:.0f}",
+                _percent(first.chance),
+                *(_percent(figure.share.value) for figure in others),
+            )
+        shown.append(table)
+    shown[-1].caption = "* published as AR@1%: the released evaluators retrieve 25 answers"
+    divided = _table(
+        f"{describe(main_scores.about)}, %", ["", "queries", *(f"R@1 {r:g} m" for r in RADII_M), "R@25 100 m"]
+    )
+    families = main_scores.families if len(main_scores.families) > 1 else ()
+    for group in (*families, *main_scores.groups, main_scores.overall):
+        values = [group.figure("R@1", radius) for radius in RADII_M] + [group.figure("R@25", 100.0)]
+        divided.add_row(group.name, f"{group.queries:,}", *(_percent(v.share.value) for v in values))
+    return [*shown, divided]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}" if math.isfinite(share) else "–"
+
+
+def _table(title: str, columns: Sequence[str]) -> Table:
+    table = Table(
+        title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
+    )
+    for i, name in enumerate(columns):
+        table.add_column(name, justify="right" if i else "left", no_wrap=bool(i))
+    return table
+
+
+def _texts(
+    arguments: argparse.Namespace, encoder: DescriptorEncoder, evaluation_set: EvaluationSet, main_scores: Scores
+) -> PageTexts:
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    ground = "none" if evaluation_set.ground is None else f"{len(evaluation_set.ground):,} scans"
+    words = {
+        "simulated": _SIMULATED_WORDS,
+        "simulated_small": _SIMULATED_WORDS,
+        "amsterdam": _AMSTERDAM_WORDS,
+    }.get(evaluation_set.name, ())
+    source = evaluation_set.name if arguments.dataset is None else arguments.dataset.name
+    areas = len(evaluation_set.area_names)
+    return PageTexts(
+        title=f"Benchmark {source}: {_label(arguments)}",
+        facts={
+            "queries": f"{len(evaluation_set.queries):,} ground scans in {areas} area{'s' * (areas != 1)}",
+            "aerial database": f"{len(evaluation_set.aerial):,} submaps",
+            "ground database": ground,
+            "weights": f"{_label(arguments)} ({encoder.fingerprint[:12]})",
+            "descriptor": f"{main_scores.about.descriptor_size} numbers",
+            "data": evaluation_set.fingerprint(),
+        },
+        footer=f"Written by crossloc3d_ros {own_version()} on {today}. Search: exact, by faiss.",
+        cloud_width_m=2.0 * encoder.preprocessing.half_extent_m,
+        words=words,
+    )
+
+
+_SIMULATED_WORDS = (
+    "The towns are simulated and held out: their seeds belong to no training set, and the families named as held out "
+    "were never learned from. Flown at one epoch, driven at another: cars, people and some trees and buildings differ.",
+)
+_AMSTERDAM_WORDS = (
+    "The geometry is real, the scans are not: a laser was cast through a surface made of the survey of 2014 and looked "
+    "for in the survey of 2010. Facades are guessed from above and nothing moves in the streets.",
+    "The map is small: by lot, one answer in fifteen lies within 100 m.",
+)
+
+
+def _label(arguments: argparse.Namespace) -> str:
+    return "shipped weights" if arguments.weights is None else str(arguments.weights.stem)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
