@@ -197,6 +197,7 @@ class TrainConfig:
     clip_norm: float = option(5.0, "longest gradient; 0 = any", low=0.0, high=1e6)
     ema_decay: float = option(0.99, "of the averaged weights, once warm", low=0.0, high=1.0)
     headings: int = option(1, "1: learn not to mind the heading; more: the query is tried in so many", low=1, high=64)
+    turns: int = option(1, "with one heading: turns over which a query's descriptor is averaged", low=1, high=64)
     offset_m: float = option(9.5, "a submap's centre lies at most so far from its scan, each way", low=0.0, high=100.0)
     neighbour_m: float = option(20.0, "nearer places of one town are neither match nor mismatch", low=0.0, high=1e4)
     near_share: float = option(0.5, "share of places drawn near another of the batch: hard negatives", low=0, high=1)
@@ -225,6 +226,8 @@ class TrainConfig:
             raise ConfigError(f"'milestones' must ascend, got {self.milestones}")
         if self.precision == "bfloat16" and self.device == "cpu":
             raise ConfigError("'precision' bfloat16 needs the device cuda")
+        if self.headings > 1 and self.turns > 1:
+            raise ConfigError("'turns' averages over the heading, which 'headings' above 1 keeps: one of them must be 1")
         if self.augmentation == "paper" and self.headings > 1:
             raise ConfigError("the paper's augmentation does not teach several headings: 'headings' must be 1")
 

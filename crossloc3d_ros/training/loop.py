@@ -179,7 +179,8 @@ class Trainer:
         self, state: RunState, held_out: Sequence[ValidationTown], log: run_folder.Log, model: Network
     ) -> Validation:
         began = time.monotonic()
-        validation = validate(held_out, lambda clouds: encode(model, clouds, self.config.device), self.config.headings)
+        config = self.config
+        validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.turns)
         log.write(
             "validation", step=state.step, elapsed_s=round(state.elapsed_s, 1),
             seconds=round(time.monotonic() - began, 1), **asdict(validation),
@@ -210,7 +211,7 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
     state.load_dict(saved)
     model = with_fresh_norms(state.averaged, BatchSampler(material.training_towns(), config), config)
     held_out = material.validation_towns()
-    validation = validate(held_out, lambda clouds: encode(model, clouds, config.device), config.headings)
+    validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.turns)
     output.parent.mkdir(parents=True, exist_ok=True)
     notes = run_folder.metadata(config, state.step, state.elapsed_s, validation, run_folder.history(folder))
     run_folder.export(output, model, config, notes)

@@ -32,7 +32,7 @@ BEST = "best.safetensors"
 FINAL = "final.safetensors"
 MODEL_CARD = "MODEL_CARD.md"
 
-_FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "log_steps"}
+_FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "log_steps", "turns"}
 """Settings that a resumed run may change: they do not touch the weights."""
 
 
@@ -203,9 +203,9 @@ def metadata(
 ) -> dict[str, str]:
     """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
 
-    `headings` says how a query is encoded, `history` which weights the run began with (`chain`). `distances` holds the
-    quantiles of the descriptor distance to the right submap and to the nearest wrong one on the held-out towns,
-    `credibility` what the localizer makes of distances.
+    `headings` and `turns` say how a query is encoded, `history` which weights the run began with (`chain`).
+    `distances` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on the
+    held-out towns, `credibility` what the localizer makes of distances.
     """
     distances = {
         "quantiles": QUANTILES,
@@ -222,6 +222,7 @@ def metadata(
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
         "headings": str(config.headings),
+        "turns": str(config.turns),
         HISTORY: json.dumps(chain),
     }
 

@@ -123,22 +123,25 @@ def fit_calibration(descriptor_distances: Float64Array, metres: Float64Array) ->
 
 
 def validate(
-    towns: Sequence[ValidationTown], encode: Callable[[list[Float32Array]], Float32Array], headings: int = 1
+    towns: Sequence[ValidationTown],
+    encode: Callable[[list[Float32Array]], Float32Array],
+    headings: int = 1,
+    turns: int = 1,
 ) -> Validation:
     """Encode all queries and submaps of the held-out towns into one database and score the retrieval.
 
     `encode` turns patches (n, 3) into descriptors (B, D). With `headings` H > 1 every query, whatever its heading, is
-    encoded H times, turned by 2 pi h / H, and its distance to a submap is the least of the H.
+    encoded H times, turned by 2 pi h / H, and its distance to a submap is the least of the H. With `turns` T > 1 and
+    one heading its descriptor is the mean of those of T turns.
     """
     query_places = Places(_towns([len(t.query_xy_m) for t in towns]), np.concatenate([t.query_xy_m for t in towns]))
     submap_places = Places(_towns([len(t.submap_xy_m) for t in towns]), np.concatenate([t.submap_xy_m for t in towns]))
     patches = [patch for town in towns for patch in town.query_patches]
     submaps = encode([patch for town in towns for patch in town.submap_patches])
-    nearest = np.full((len(patches), len(submaps)), math.inf)
-    for heading in range(headings):
-        angle_rad = 2.0 * math.pi * heading / headings
-        queries = encode([turn(patch, angle_rad) for patch in patches] if heading else patches)
-        np.minimum(nearest, euclidean_distances(queries, submaps), out=nearest)
+    count = max(headings, turns)
+    encoded = [encode([turn(patch, 2.0 * math.pi * i / count) for patch in patches]) for i in range(count)]
+    queries = encoded if headings > 1 else [np.mean(encoded, axis=0)]
+    nearest = np.min([euclidean_distances(q, submaps) for q in queries], axis=0)
     return score(nearest, ground_distances(query_places, submap_places))
 
 
