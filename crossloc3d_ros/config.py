@@ -227,7 +227,7 @@ class TrainConfig:
         if self.precision == "bfloat16" and self.device == "cpu":
             raise ConfigError("'precision' bfloat16 needs the device cuda")
         if self.headings > 1 and self.turns > 1:
-            raise ConfigError("'turns' averages over the heading, which 'headings' above 1 keeps: one of them must be 1")
+            raise ConfigError("'turns' averages over headings, which 'headings' above 1 tells apart: set one to 1")
         if self.augmentation == "paper" and self.headings > 1:
             raise ConfigError("the paper's augmentation does not teach several headings: 'headings' must be 1")
 
