@@ -14,8 +14,8 @@ both clouds for scans of one sensor. `masked` is for a scan that looks for itsel
 * The distance is the root mean square difference of heights over those cells.
 * The survey's maps are smoothed over `smooth` neighbouring sectors and rings.
 
-The submap's centre is not where the robot stands, so a scan is looked for from nine centres, `shift_m` apart (the paper's
-root shifting); a descriptor holds the maps around all of them, of which the database's places need the first alone.
+The submap's centre is not where the robot stands, so a scan is looked for from nine centres, `shift_m` apart (the
+paper's root shifting); a descriptor holds the maps around all of them, of which the database's places need the first.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ Complex64Array = npt.NDArray[np.complex64]
 class ScanContextConfig:
     """How patches become polar maps and how those are compared."""
 
-    rings: int = option(10, "rings from the centre to the patch's edge", low=1, high=200)
-    sectors: int = option(36, "sectors of the full circle: 36 = headings in steps of 10 degrees", low=4, high=720)
+    rings: int = option(16, "rings from the centre to the patch's edge", low=1, high=200)
+    sectors: int = option(48, "sectors of the full circle: 48 = headings in steps of 7.5 degrees", low=4, high=720)
     distance: Literal["masked", "cosine"] = option("masked", "for scans against surveys, or as published")
     top_deg: float = option(15.0, "the sensor's highest beam above the horizon", low=0.0, high=89.0)
     smooth: int = option(1, "cells on either side that the survey's maps are smoothed over", low=0, high=10)
@@ -132,7 +132,7 @@ class ScanContext(DescriptorEncoder):
             centre = apart.argmin(axis=1)[:, None]
             best[part] = np.take_along_axis(apart, centre, axis=1)[:, 0]
             shifts[part] = np.take_along_axis(turns.reshape(apart.shape), centre, axis=1)[:, 0]
-        return best, shifts * (2.0 * math.pi / sectors)
+        return best, np.asarray(shifts * (2.0 * math.pi / sectors), np.float64)
 
     def _centres(self) -> Float32Array:
         """Return (K, 2) the centres of a patch's maps in patch units, its own first."""
@@ -171,7 +171,8 @@ class ScanContext(DescriptorEncoder):
         reach = self._config.smooth
         if reach == 0:
             return maps
-        around = sum(np.roll(maps, step, axis=2) for step in range(-reach, reach + 1)) / (2 * reach + 1)
+        turned = [np.roll(maps, step, axis=2) for step in range(-reach, reach + 1)]
+        around = np.mean(turned, axis=0, dtype=np.float32)
         total, count = np.zeros_like(maps), np.zeros((1, maps.shape[1], 1), np.float32)
         for step in range(-reach, reach + 1):
             to, of = _overlap(maps.shape[1], step)
