@@ -10,8 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crossloc3d_ros.simulation.layout import Layout, Plan, Rect, Street
+from crossloc3d_ros.simulation.canals import KINDS as CANAL_KINDS
+from crossloc3d_ros.simulation.canals import draw_quays
+from crossloc3d_ros.simulation.drawing import divide, parking_rows, row_houses, rows_of_trees, scatter_trees
+from crossloc3d_ros.simulation.harbour import KINDS as HARBOUR_KINDS
+from crossloc3d_ros.simulation.layout import Belt, Layout, Plan, Rect, Street
 from crossloc3d_ros.simulation.scene import Label
+from crossloc3d_ros.simulation.village import KINDS as VILLAGE_KINDS
 
 Generator = np.random.Generator
 
@@ -34,13 +39,21 @@ class Family(NamedTuple):
     """Share of the main streets that are canals."""
     pedestrians: float
     """People a hundred metres of street."""
+    flat: bool = False
+    """Whether the ground is mostly level."""
+    belt: Belt | None = None
+    """Canals in parallel instead of streets that divide and divide again."""
+    avenues: bool = True
+    """Whether an avenue may cut across the streets."""
+    ground_cell_m: float = 3.0
+    """How finely the ground is drawn: the steps of its shores."""
 
 
 FAMILIES: dict[str, Family] = {
     "old_town": Family(
         ("irregular", "curved", "grid"), (38.0, 85.0), (17.0, 8.5, 5.0), 1.0,
         {"closed": 0.72, "terraces": 0.1, "square": 0.06, "church": 0.04, "monument": 0.04, "garden": 0.04},
-        0.35, 0.5, 0.45, 3.0,
+        0.35, 0.5, 0.45, 3.0, flat=True,
     ),
     "suburb": Family(
         ("curved", "irregular", "grid"), (48.0, 95.0), (14.0, 10.5, 8.0), 0.8,
@@ -55,7 +68,7 @@ FAMILIES: dict[str, Family] = {
     "industry": Family(
         ("grid", "irregular"), (80.0, 170.0), (20.0, 15.0, 11.0), 0.7,
         {"halls": 0.72, "tanks": 0.08, "car_park": 0.1, "campus": 0.06, "garden": 0.04},
-        0.2, 0.25, 0.08, 0.3,
+        0.2, 0.25, 0.08, 0.3, flat=True,
     ),
     "park_edge": Family(
         ("curved", "irregular"), (60.0, 120.0), (16.0, 10.0, 7.0), 1.0,
@@ -67,7 +80,29 @@ FAMILIES: dict[str, Family] = {
         {"slabs": 0.5, "towers": 0.18, "terraces": 0.12, "garden": 0.08, "car_park": 0.07, "square": 0.05},
         0.5, 0.5, 0.05, 1.0,
     ),
+    "canal_town": Family(
+        ("curved", "irregular", "curved"), (45.0, 95.0), (14.0, 9.0, 6.0), 0.8,
+        {"canal_houses": 0.72, "closed": 0.08, "square": 0.09, "garden": 0.05, "church": 0.03, "monument": 0.03},
+        0.4, 0.5, 0.0, 3.0, flat=True, avenues=False, ground_cell_m=1.5,
+        belt=Belt((20.0, 45.0), (6.5, 11.0), (60.0, 125.0), (65.0, 150.0), (6.0, 12.0), 0.12, 0.1),
+    ),
+    "village": Family(
+        ("irregular", "curved"), (50.0, 105.0), (10.0, 7.5, 5.5), 1.0,
+        {"farmstead": 0.5, "cottages": 0.22, "orchard": 0.1, "meadow": 0.06, "church": 0.06, "garden": 0.06},
+        0.12, 0.05, 0.0, 0.4, avenues=False,
+    ),
+    "harbour": Family(
+        ("grid", "irregular"), (95.0, 170.0), (24.0, 17.0, 13.0), 0.7,
+        {"containers": 0.34, "warehouses": 0.3, "basin": 0.24, "tanks": 0.07, "car_park": 0.05},
+        0.05, 0.15, 0.0, 0.3, flat=True, avenues=False, ground_cell_m=1.5,
+    ),
 }  # fmt: skip
+
+HELD_OUT_FAMILIES = ("harbour", "village")
+"""Never learned from: the benchmark shows with them what a kind of town is worth that training has not seen."""
+TRAINING_FAMILIES = tuple(sorted(set(FAMILIES) - set(HELD_OUT_FAMILIES)))
+FAMILIES_BY_SEED = ("campus", "estate", "industry", "old_town", "park_edge", "suburb")
+"""What a seed alone chooses from. Frozen: with another list a seed would make another town."""
 
 
 def draw_block(kind: str, plan: Plan, rect: Rect, rng: Generator) -> None:
@@ -78,32 +113,6 @@ def draw_block(kind: str, plan: Plan, rect: Rect, rng: Generator) -> None:
 # Old town ------------------------------------------------------------------------------------------------------------
 
 
-def _house(
-    plan: Plan, rect: Rect, eave: float, rng: Generator, *, front_along_u: bool, flat: float = 0.25, gable: float = 0.45
-) -> int:
-    """Draw a town house: flat, ridge along the street, or gable to the street, with chimneys and dormers."""
-    owner = plan.owner(*rect.centre)
-    draw = rng.random(6)
-    across = rect.height if front_along_u else rect.width
-    front = rect.width if front_along_u else rect.height
-    if draw[0] < flat:
-        plan.wing(owner, rect, eave)
-        top = eave
-        if draw[4] < 0.3 and min(rect.width, rect.height) > 5:
-            plan.wing(owner, rect.inset(1.5), eave + 2.8, bottom=eave - 0.5)
-    else:
-        ridge_along_street = draw[0] > flat + gable
-        span = across if ridge_along_street else front
-        top = eave + min(0.5 * span * (0.6 + 0.7 * draw[1]), 6.5)
-        along_u = front_along_u if ridge_along_street else not front_along_u
-        plan.wing(owner, rect, eave, top, along_u=along_u, hip=0.25 * float(draw[2] < 0.3))
-    if draw[3] < 0.6:
-        u = rect.u0 + rect.width * (0.1 + 0.8 * draw[4])
-        v = rect.v0 + rect.height * (0.1 + 0.8 * draw[5])
-        plan.wing(owner, Rect(u - 0.45, v - 0.45, u + 0.45, v + 0.45), top + 0.8, bottom=eave - 0.5)
-    return owner
-
-
 def _closed(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Row houses shoulder to shoulder around courtyards."""
     depth = min(rng.uniform(8.5, 14.0), 0.5 * min(rect.width, rect.height))
@@ -111,48 +120,9 @@ def _closed(plan: Plan, rect: Rect, rng: Generator) -> None:
     flat, gable = rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.7)
     width = rng.uniform(4.8, 9.5)
     missing = rng.uniform(0.0, 0.08)
-    inner = rect.inset(depth)
-    sides = [
-        (Rect(rect.u0, rect.v0, rect.u1, inner.v0), True, 1.0), (Rect(rect.u0, inner.v1, rect.u1, rect.v1), True, -1.0),
-        (Rect(rect.u0, inner.v0, inner.u0, inner.v1), False, 1.0),
-        (Rect(inner.u1, inner.v0, rect.u1, inner.v1), False, -1.0),
-    ]  # fmt: skip
-    for side, along_u, inward in sides:
-        length = side.width if along_u else side.height
-        position = 0.0
-        while position < length - 0.5:
-            front = width * rng.uniform(0.6, 1.5)
-            if length - position - front < 0.6 * width:
-                front = length - position
-            start, end = position, position + front
-            position = end
-            if rng.random() < missing:
-                continue
-            back = rng.uniform(-1.5, 1.0) if inner.width > 4 and inner.height > 4 else 0.0
-            if along_u:
-                low, high = (side.v0, side.v1 + back) if inward > 0 else (side.v0 - back, side.v1)
-                house = Rect(side.u0 + start, low, side.u0 + end, high)
-            else:
-                low, high = (side.u0, side.u1 + back) if inward > 0 else (side.u0 - back, side.u1)
-                house = Rect(low, side.v0 + start, high, side.v0 + end)
-            owner = _house(plan, house, max(3.2, base + spread * rng.standard_normal()), rng,
-                           front_along_u=along_u, flat=flat, gable=gable)  # fmt: skip
-            room = (inner.height if along_u else inner.width) * 0.42
-            if rng.random() < 0.45 and room > 3:
-                reach, share = rng.uniform(2.0, room), rng.uniform(0.35, 0.8)
-                if along_u:
-                    near = house.v1 if inward > 0 else house.v0 - reach
-                    shed = Rect(house.u0, near, house.u0 + share * house.width, near + reach)
-                else:
-                    near = house.u1 if inward > 0 else house.u0 - reach
-                    shed = Rect(near, house.v0, near + reach, house.v0 + share * house.height)
-                plan.wing(owner, shed, rng.uniform(2.6, 6.5))
-    if inner.width > 6 and inner.height > 6:
-        _scatter_trees(plan, inner.inset(2.0), rng, per_hectare=rng.uniform(10, 90), height=(5.0, 12.0))
-        if rng.random() < 0.3 and inner.width > 16 and inner.height > 16:
-            hall = inner.inset(rng.uniform(5.0, 7.5))
-            eave = rng.uniform(3.5, 8.0)
-            plan.wing(plan.owner(*hall.centre), hall, eave, eave + rng.uniform(0, 3))
+    row_houses(
+        plan, rect, rng, depth=depth, eave=base, spread=spread, flat=flat, gable=gable, front=width, missing=missing
+    )
 
 
 def _terraces(plan: Plan, rect: Rect, rng: Generator) -> None:
@@ -190,7 +160,7 @@ def _terraces(plan: Plan, rect: Rect, rng: Generator) -> None:
                         plan.wing(plan.owner(u, v), Rect(u, v, u + 2.5, v + 2.5), 2.2, 2.9)
                 position += front
             position += rng.uniform(2.0, 7.0)
-    _scatter_trees(plan, rect.inset(2.0), rng, per_hectare=rng.uniform(10, 50), height=(3.5, 9.0))
+    scatter_trees(plan, rect.inset(2.0), rng, per_hectare=rng.uniform(10, 50), height=(3.5, 9.0))
     if rng.random() < 0.6:
         plan.enclosure(rect.inset(0.6), 0.6, rng.uniform(0.9, 2.0), Label.VEGETATION, rng)
 
@@ -219,7 +189,7 @@ def _square(plan: Plan, rect: Rect, rng: Generator) -> None:
             u, v = rng.uniform(rect.u0 + 6, rect.u1 - 6), rng.uniform(rect.v0 + 6, rect.v1 - 6)
             plan.wing(plan.owner(u, v), Rect(u - 1.6, v - 1.2, u + 1.6, v + 1.2), 2.5, 3.0, bottom=2.1,
                       label=Label.STRUCTURE)  # fmt: skip
-    _parking_rows(plan, Rect(rect.u0, rect.v0, rect.u1, rect.v0 + 6), rng, chance=0.5)
+    parking_rows(plan, Rect(rect.u0, rect.v0, rect.u1, rect.v0 + 6), rng, chance=0.5)
 
 
 def _church(plan: Plan, rect: Rect, rng: Generator) -> None:
@@ -243,7 +213,7 @@ def _church(plan: Plan, rect: Rect, rng: Generator) -> None:
     plan.wing(
         owner, place(-length / 2 - 2 * half, -half, -length / 2, half), tower, tower + rng.uniform(0, 18), hip=0.5
     )
-    _scatter_trees(plan, rect.inset(3), rng, per_hectare=30, height=(6, 14))
+    scatter_trees(plan, rect.inset(3), rng, per_hectare=30, height=(6, 14))
 
 
 def _monument(plan: Plan, rect: Rect, rng: Generator) -> None:
@@ -341,11 +311,11 @@ def _arcade(plan: Plan, rect: Rect, height: float, rng: Generator) -> None:
 
 def _campus(plan: Plan, rect: Rect, rng: Generator) -> None:
     """One to four large buildings of several wings on lawns with rows and clusters of trees."""
-    lots = _divide(rect.inset(rng.uniform(4, 10)), rng, least=30.0, most=rng.uniform(45, 90), gap=rng.uniform(8, 20))
+    lots = divide(rect.inset(rng.uniform(4, 10)), rng, least=30.0, most=rng.uniform(45, 90), gap=rng.uniform(8, 20))
     rise, hip = (rng.uniform(2, 5), 0.2) if rng.random() < 0.3 else (0.0, 0.0)
     for lot in lots:
         if rng.random() < 0.12:
-            _scatter_trees(plan, lot, rng, per_hectare=60)
+            scatter_trees(plan, lot, rng, per_hectare=60)
             continue
         body = Rect(
             lot.u0 + rng.uniform(0, 0.2) * lot.width, lot.v0 + rng.uniform(0, 0.2) * lot.height,
@@ -359,10 +329,10 @@ def _campus(plan: Plan, rect: Rect, rng: Generator) -> None:
         owner = _composite(plan, body, rng, shape, rng.uniform(11, 20), height, hip, rise)
         if shape in ("slab", "setback", "court") and rise == 0:
             _roof_boxes(plan, owner, Rect(body.u0, body.v0, body.u1, body.v0 + 11), height, rng)
-        _scatter_trees(plan, lot, rng, per_hectare=rng.uniform(0, 30))
-    _rows_of_trees(plan, rect, rng, 0.5)
+        scatter_trees(plan, lot, rng, per_hectare=rng.uniform(0, 30))
+    rows_of_trees(plan, rect, rng, 0.5)
     if rng.random() < 0.5:
-        _parking_rows(plan, Rect(rect.u0, rect.v1 - 7, rect.u1, rect.v1), rng, chance=rng.uniform(0.2, 0.9))
+        parking_rows(plan, Rect(rect.u0, rect.v1 - 7, rect.u1, rect.v1), rng, chance=rng.uniform(0.2, 0.9))
     if rng.random() < 0.3:
         plan.barrier(rect.u0 + 2, rect.v0 + 1, rect.u1 - 2, rect.v0 + 1, 0.8, rng.uniform(0.9, 1.8), Label.VEGETATION)
 
@@ -399,15 +369,15 @@ def _slabs(plan: Plan, rect: Rect, rng: Generator) -> None:
                 plan.wing(owner, bay, top - rng.uniform(0, 1.5), bottom=0.0 if rng.random() < 0.5 else 2.6)
         if roof == 0:
             _roof_boxes(plan, owner, body, top, rng)
-    _scatter_trees(plan, rect.inset(2), rng, per_hectare=rng.uniform(10, 60), height=(5, 15))
-    _rows_of_trees(plan, rect, rng, 0.4)
+    scatter_trees(plan, rect.inset(2), rng, per_hectare=rng.uniform(10, 60), height=(5, 15))
+    rows_of_trees(plan, rect, rng, 0.4)
     if rng.random() < 0.6:
-        _parking_rows(plan, Rect(rect.u0, rect.v0, rect.u1, rect.v0 + 6), rng, chance=rng.uniform(0.3, 0.9))
+        parking_rows(plan, Rect(rect.u0, rect.v0, rect.u1, rect.v0 + 6), rng, chance=rng.uniform(0.3, 0.9))
 
 
 def _towers(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Free-standing towers with low plinths."""
-    for lot in _divide(rect.inset(6), rng, least=28, most=50, gap=12):
+    for lot in divide(rect.inset(6), rng, least=28, most=50, gap=12):
         size_u, size_v = rng.uniform(15, 24), rng.uniform(15, 24)
         u = rng.uniform(lot.u0, max(lot.u1 - size_u, lot.u0 + 0.1))
         v = rng.uniform(lot.v0, max(lot.v1 - size_v, lot.v0 + 0.1))
@@ -419,8 +389,8 @@ def _towers(plan: Plan, rect: Rect, rng: Generator) -> None:
         if rng.random() < 0.6:
             plan.wing(owner, Rect(u - rng.uniform(0, 8), v - rng.uniform(0, 8), u + size_u + 3, v + size_v + 3),
                       rng.uniform(3.5, 6.0))  # fmt: skip
-    _scatter_trees(plan, rect.inset(2), rng, per_hectare=rng.uniform(15, 60), height=(5, 15))
-    _parking_rows(plan, Rect(rect.u0, rect.v1 - 7, rect.u1, rect.v1), rng, chance=0.6)
+    scatter_trees(plan, rect.inset(2), rng, per_hectare=rng.uniform(15, 60), height=(5, 15))
+    parking_rows(plan, Rect(rect.u0, rect.v1 - 7, rect.u1, rect.v1), rng, chance=0.6)
 
 
 # Suburb ---------------------------------------------------------------------------------------------------------------
@@ -490,7 +460,7 @@ def _single_house(plan: Plan, lot: Rect, rng: Generator, along_u: bool, first_ro
 
 def _halls(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Large halls with flat, shallow or saw-tooth roofs, yards with containers and lorries, fences."""
-    for lot in _divide(rect.inset(rng.uniform(3, 8)), rng, least=35, most=rng.uniform(60, 110), gap=rng.uniform(8, 18)):
+    for lot in divide(rect.inset(rng.uniform(3, 8)), rng, least=35, most=rng.uniform(60, 110), gap=rng.uniform(8, 18)):
         yard = rng.uniform(0.0, 0.4)
         body = Rect(lot.u0, lot.v0 + yard * lot.height * float(rng.random() < 0.5), lot.u1,
                     lot.v1 - yard * lot.height * float(rng.random() < 0.5))  # fmt: skip
@@ -522,13 +492,13 @@ def _halls(plan: Plan, rect: Rect, rng: Generator) -> None:
                                rng.uniform(1.0, 3.0), rng.uniform(0.8, 2.6), float(Label.BUILDING)))  # fmt: skip
     if rng.random() < 0.7:
         plan.enclosure(rect.inset(0.8), 0.1, rng.uniform(1.6, 2.4), Label.STRUCTURE, rng)
-    _rows_of_trees(plan, rect, rng, 0.2)
-    _scatter_trees(plan, rect.inset(1), rng, per_hectare=rng.uniform(0, 12))
+    rows_of_trees(plan, rect, rng, 0.2)
+    scatter_trees(plan, rect.inset(1), rng, per_hectare=rng.uniform(0, 12))
 
 
 def _tanks(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Round tanks and silos."""
-    for lot in _divide(rect.inset(5), rng, least=14, most=32, gap=5):
+    for lot in divide(rect.inset(5), rng, least=14, most=32, gap=5):
         radius = 0.5 * min(lot.width, lot.height) * rng.uniform(0.6, 0.95)
         u, v = lot.centre
         height = rng.uniform(6, 18)
@@ -549,7 +519,7 @@ def _garden(plan: Plan, rect: Rect, rng: Generator) -> None:
             a, b = u + spread * rng.standard_normal(), v + spread * rng.standard_normal()
             if rect.u0 < a < rect.u1 and rect.v0 < b < rect.v1:
                 plan.tree(a, b, rng, height=(5, 18), kinds=(0.7, 0.15, 0.05, 0.1))
-    _rows_of_trees(plan, rect, rng, 0.6)
+    rows_of_trees(plan, rect, rng, 0.6)
     if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
         plan.water.append(rect.inset(rng.uniform(12, 18)))
     if rng.random() < 0.4:
@@ -575,8 +545,8 @@ def _car_park(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Rows of parking bays with trees between."""
     chance = rng.uniform(0.15, 0.95)
     for v in np.arange(rect.v0 + 4, rect.v1 - 8, 16.5):
-        _parking_rows(plan, Rect(rect.u0 + 3, v, rect.u1 - 3, v + 5), rng, chance=chance, certain=True)
-        _parking_rows(plan, Rect(rect.u0 + 3, v + 5, rect.u1 - 3, v + 10), rng, chance=chance, certain=True)
+        parking_rows(plan, Rect(rect.u0 + 3, v, rect.u1 - 3, v + 5), rng, chance=chance, certain=True)
+        parking_rows(plan, Rect(rect.u0 + 3, v + 5, rect.u1 - 3, v + 10), rng, chance=chance, certain=True)
         if rng.random() < 0.5:
             for u in np.arange(rect.u0 + 6, rect.u1 - 6, rng.uniform(9, 16)):
                 plan.tree(u, v + 5, rng, height=(4.5, 8.0))
@@ -585,52 +555,7 @@ def _car_park(plan: Plan, rect: Rect, rng: Generator) -> None:
         plan.wing(plan.owner(u, v), Rect(u, v, u + rng.uniform(6, 20), v + rng.uniform(5, 12)), rng.uniform(3, 6))
 
 
-# Shared ---------------------------------------------------------------------------------------------------------------
-
-
-def _divide(rect: Rect, rng: Generator, *, least: float, most: float, gap: float) -> list[Rect]:
-    """Divide a block into lots with gaps between."""
-    longer = max(rect.width, rect.height)
-    if longer < most or longer < 2 * least + gap:
-        return [rect] if min(rect.width, rect.height) > 8 else []
-    share = rng.uniform(0.38, 0.62)
-    if rect.width >= rect.height:
-        middle = rect.u0 + share * rect.width
-        halves = [Rect(rect.u0, rect.v0, middle - gap / 2, rect.v1), Rect(middle + gap / 2, rect.v0, rect.u1, rect.v1)]
-    else:
-        middle = rect.v0 + share * rect.height
-        halves = [Rect(rect.u0, rect.v0, rect.u1, middle - gap / 2), Rect(rect.u0, middle + gap / 2, rect.u1, rect.v1)]
-    return [lot for half in halves for lot in _divide(half, rng, least=least, most=most, gap=gap)]
-
-
-def _scatter_trees(
-    plan: Plan, rect: Rect, rng: Generator, *, per_hectare: float, height: tuple[float, float] = (5.0, 15.0)
-) -> None:
-    for _ in range(rng.poisson(max(per_hectare, 0) * max(rect.width, 0) * max(rect.height, 0) / 1e4)):
-        plan.tree(rng.uniform(rect.u0, rect.u1), rng.uniform(rect.v0, rect.v1), rng, height=height)
-
-
-def _rows_of_trees(plan: Plan, rect: Rect, rng: Generator, chance: float) -> None:
-    """Draw rows of like trees just inside some of a block's sides."""
-    tall, spacing, margin = rng.uniform(7, 15), rng.uniform(7, 13), rng.uniform(2, 4)
-    kinds = (0.9, 0.0, 0.1, 0.0) if rng.random() < 0.8 else (0.1, 0.0, 0.9, 0.0)
-    for along_u, line in ((True, rect.v0 + margin), (True, rect.v1 - margin), (False, rect.u0 + margin),
-                          (False, rect.u1 - margin)):  # fmt: skip
-        if rng.random() > chance:
-            continue
-        low, high = (rect.u0, rect.u1) if along_u else (rect.v0, rect.v1)
-        for position in np.arange(low + 4, high - 4, spacing):
-            if rng.random() < 0.92:
-                u, v = (position, line) if along_u else (line, position)
-                plan.tree(u, v, rng, height=(tall, 1.15 * tall), kinds=kinds)
-
-
-def _parking_rows(plan: Plan, rect: Rect, rng: Generator, *, chance: float, certain: bool = False) -> None:
-    """Draw bays at right angles to u along a strip, in one stretch or all along."""
-    start, end = (0.0, 1.0) if certain else np.sort(rng.random(2))
-    v = 0.5 * (rect.v0 + rect.v1)
-    for u in np.arange(rect.u0 + start * rect.width + 1.3, rect.u0 + end * rect.width - 1.3, 2.6):
-        plan.cars.append((u, v, np.pi / 2, chance, rng.random()))
+# Streets --------------------------------------------------------------------------------------------------------------
 
 
 def _draw_canal(plan: Plan, street: Street, half_width: float, rng: Generator) -> None:
@@ -645,6 +570,9 @@ def _draw_canal(plan: Plan, street: Street, half_width: float, rng: Generator) -
 
 def draw_street(plan: Plan, street: Street, family: Family, rng: Generator) -> None:
     """Draw what lines a street: canal, trees, parked cars, lamps, signs."""
+    if street.quay_m > 0:
+        draw_quays(plan, street, rng)
+        return
     half = street.width / 2
     canal = street.level < 3 and street.width > 15 and rng.random() < family.canals
     bank = float(rng.uniform(4.5, 6.5)) if canal else 0.0
@@ -689,5 +617,5 @@ def draw_street(plan: Plan, street: Street, family: Family, rng: Generator) -> N
 _KINDS: dict[str, Callable[[Plan, Rect, Generator], None]] = {
     "closed": _closed, "terraces": _terraces, "square": _square, "church": _church, "monument": _monument,
     "campus": _campus, "slabs": _slabs, "towers": _towers, "detached": _detached, "halls": _halls, "tanks": _tanks,
-    "garden": _garden, "wood": _wood, "car_park": _car_park,
+    "garden": _garden, "wood": _wood, "car_park": _car_park, **CANAL_KINDS, **VILLAGE_KINDS, **HARBOUR_KINDS,
 }  # fmt: skip

@@ -7,6 +7,8 @@ thousand parts becomes triangles in a few numpy calls.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -55,6 +57,10 @@ class Street(NamedTuple):
     along_u: bool
     level: int
     """0 the town's first divisions, growing towards the lanes."""
+    quay_m: float = 0.0
+    """Width of the quays on either side of the water in the middle; 0: a street without water of its own."""
+    bridges: tuple[tuple[float, float], ...] = ()
+    """Where the water is crossed: from and to, along the street."""
 
     @property
     def width(self) -> float:
@@ -171,6 +177,93 @@ def draw_streets(
     return blocks, streets
 
 
+class Belt(NamedTuple):
+    """Measures of a quarter of parallel canals."""
+
+    water_m: tuple[float, float]
+    quay_m: tuple[float, float]
+    depth_m: tuple[float, float]
+    """From the houses of one canal to those of the next."""
+    cross_m: tuple[float, float]
+    """Between neighbouring cross streets."""
+    lane_m: tuple[float, float]
+    cross_canals: float
+    """Share of the cross streets that are canals."""
+    broad: float
+    """Share of the canals that are a broad river or an old harbour."""
+
+
+def draw_belt(extent: Rect, belt: Belt, rng: np.random.Generator) -> tuple[list[Rect], list[Street]]:
+    """Divide `extent` into blocks by canals along u, with quays on both sides, and streets and canals across."""
+    canals: list[tuple[float, float, float]] = []  # middle, half of the whole width, quay
+    v = extent.v0 + rng.uniform(-0.5, 0.5) * belt.depth_m[1]
+    while v < extent.v1:
+        canals.append(_draw_canal(v, belt, rng))
+        v += 2 * canals[-1][1] + rng.uniform(*belt.depth_m)
+    crossings: list[tuple[float, float, float]] = []
+    u = extent.u0 + rng.uniform(0.0, 1.0) * belt.cross_m[1]
+    while u < extent.u1 - 20.0:
+        if rng.random() < belt.cross_canals:
+            crossings.append(_draw_canal(u, belt._replace(broad=0.0), rng))
+            u += crossings[-1][1]
+        else:
+            crossings.append((u, 0.5 * rng.uniform(*belt.lane_m), 0.0))
+        u += rng.uniform(*belt.cross_m)
+    streets = []
+    for middle, half, quay in canals:
+        bridges: list[tuple[float, float]] = []
+        for across, reach, shore in crossings:
+            if shore > 0:
+                bridges += [(across - reach, across - reach + shore), (across + reach - shore, across + reach)]
+            elif rng.random() < 0.75:
+                bridges.append((across - reach, across + reach))
+        rect = Rect(extent.u0, middle - half, extent.u1, middle + half)
+        streets.append(Street(rect, True, 0, quay, tuple((a - extent.u0, b - extent.u0) for a, b in bridges)))
+    for across, reach, shore in crossings:
+        if shore > 0:
+            bridges = []
+            for middle, half, quay in canals:
+                bridges += [(middle - half, middle - half + quay), (middle + half - quay, middle + half)]
+            rect = Rect(across - reach, extent.v0, across + reach, extent.v1)
+            streets.append(Street(rect, False, 1, shore, tuple((a - extent.v0, b - extent.v0) for a, b in bridges)))
+    blocks: list[Rect] = []
+    edges = [extent.v0, *(edge for middle, half, _ in canals for edge in (middle - half, middle + half)), extent.v1]
+    for low, high in zip(edges[::2], edges[1::2], strict=True):
+        if high - low > 12.0:
+            _divide_band(Rect(extent.u0, low, extent.u1, high), crossings, belt, blocks, streets, rng)
+    return blocks, streets
+
+
+def _draw_canal(middle: float, belt: Belt, rng: np.random.Generator) -> tuple[float, float, float]:
+    water = rng.uniform(*belt.water_m) * (rng.uniform(1.8, 3.2) if rng.random() < belt.broad else 1.0)
+    quay = rng.uniform(*belt.quay_m)
+    return middle, 0.5 * water + quay, quay
+
+
+def _divide_band(
+    band: Rect, crossings: list[tuple[float, float, float]], belt: Belt, blocks: list[Rect], streets: list[Street],
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Divide the ground between two canals by its cross streets and, where it is deep, by a lane along its middle."""
+    lanes: list[tuple[float, float]] = []
+    if band.height > 0.75 * belt.depth_m[1] and rng.random() < 0.5:
+        half = 0.5 * rng.uniform(*belt.lane_m)
+        middle = band.v0 + rng.uniform(0.42, 0.58) * band.height
+        lanes.append((middle - half, middle + half))
+        streets.append(Street(Rect(band.u0, middle - half, band.u1, middle + half), True, 7))
+    rows = [band.v0, *(edge for lane in lanes for edge in lane), band.v1]
+    start = band.u0
+    for across, reach, shore in [*crossings, (band.u1, 0.0, 0.0)]:
+        if shore == 0.0 and across < band.u1 and rng.random() < 0.15:
+            continue  # two blocks in one
+        for low, high in zip(rows[::2], rows[1::2], strict=True):
+            if across - reach - start > 8.0:
+                blocks.append(Rect(start, low, across - reach, high))
+        if shore == 0.0 and across < band.u1:
+            streets.append(Street(Rect(across - reach, band.v0, across + reach, band.v1), False, 4))
+        start = across + reach
+
+
 BROADLEAF, CONIFER, COLUMN, BUSH = range(4)
 
 
@@ -214,6 +307,27 @@ class Plan:
         u0, v0, u1, v1 = rect
         corners = (u0, v0, u1, v0, u1, v1, u0, v1) if along else (u1, v0, u1, v1, u0, v1, u0, v0)
         self.wings.append((*corners, bottom, eave, eave if ridge is None else ridge, hip, float(label), float(owner)))
+
+    @contextmanager
+    def turned(self, centre: tuple[float, float], angle_rad: float) -> Iterator[None]:
+        """Turn what is drawn meanwhile about `centre`; water and places for people stay where they are drawn."""
+        wings, anchors, trees = len(self.wings), len(self.anchors), len(self.trees)
+        cars, poles = len(self.cars), len(self.poles)
+        yield
+        cosine, sine = float(np.cos(angle_rad)), float(np.sin(angle_rad))
+
+        def turn(u: float, v: float) -> tuple[float, float]:
+            du, dv = u - centre[0], v - centre[1]
+            return centre[0] + cosine * du - sine * dv, centre[1] + sine * du + cosine * dv
+
+        self.wings[wings:] = [
+            (*turn(*row[0:2]), *turn(*row[2:4]), *turn(*row[4:6]), *turn(*row[6:8]), *row[8:])
+            for row in self.wings[wings:]
+        ]
+        self.anchors[anchors:] = [turn(*row) for row in self.anchors[anchors:]]
+        self.trees[trees:] = [(*turn(*row[:2]), *row[2:]) for row in self.trees[trees:]]
+        self.poles[poles:] = [(*turn(*row[:2]), *row[2:]) for row in self.poles[poles:]]
+        self.cars[cars:] = [(*turn(*row[:2]), row[2] + angle_rad, *row[3:]) for row in self.cars[cars:]]
 
     def barrier(self, u0: float, v0: float, u1: float, v1: float, thick: float, height: float, label: Label) -> None:
         """Draw a hedge, wall or fence along an axis-parallel line, in pieces that follow the bends."""

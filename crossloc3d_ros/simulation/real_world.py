@@ -55,19 +55,42 @@ def world_from_survey(
     one that is too large.
     """
     points, classes, grid_crs = _read(paths, crs, progress)
-    ground = np.isin(classes, (GROUND, BRIDGE))
-    if int(ground.sum()) < 100:
-        raise AerialDataError(
-            f"only {int(ground.sum())} of {len(points):,} points are classified as ground; a world needs classified "
-            "surveys (class 2)"
-        )
     low, high = points.min(axis=0), points.max(axis=0)
     if float(np.prod(high[:2] - low[:2])) > 9e6:
         raise AerialDataError("the survey covers more than 9 square kilometres; name fewer files")
     origin = np.array([np.round((low[0] + high[0]) / 2), np.round((low[1] + high[1]) / 2), 0.0])
-    local = points - origin
     bounds = Bounds(*_snap(low[:2] - origin[:2], high[:2] - origin[:2]))
+    return world_from_points(
+        points - origin, classes, bounds, name=Path(paths[0]).stem, crs=grid_crs, origin_grid=origin,
+        cell_m=cell_m, seed=seed, progress=progress,
+    )  # fmt: skip
 
+
+def world_from_points(
+    local: Float64Array,
+    classes: UInt8Array,
+    bounds: Bounds,
+    *,
+    name: str,
+    crs: str,
+    origin_grid: Float64Array,
+    cell_m: float = 0.5,
+    seed: int = 0,
+    least_share: float = 0.999,
+    progress: Callable[[str, float, float, str], None] | None = None,
+) -> World:
+    """Return the world that a survey's points show.
+
+    `local` (N, 3) metres from `origin_grid` (3,) in `crs`, `classes` (N,) ASPRS, `bounds` on whole metres;
+    `least_share` of the largest connected free ground that another needs to be driven on; the rest as for
+    `world_from_survey`. Raises AerialDataError where hardly a point is classified as ground.
+    """
+    ground = np.isin(classes, (GROUND, BRIDGE))
+    if int(ground.sum()) < 100:
+        raise AerialDataError(
+            f"only {int(ground.sum())} of {len(local):,} points are classified as ground; a world needs classified "
+            "surveys (class 2)"
+        )
     if progress is not None:
         progress("surface", 0, 3, "steps")
     terrain = _terrain(local, ground, bounds)
@@ -83,12 +106,12 @@ def world_from_survey(
     scene = mesh.scene_from(parts)
     if progress is not None:
         progress("surface", 2, 3, "steps")
-    clearance, preference = _free(local, height, loose, roof_mask, seen, bounds, cell_m)
+    clearance, preference = _free(local, height, loose, roof_mask, seen, bounds, cell_m, least_share)
     if progress is not None:
         progress("surface", 3, 3, "steps")
     return World(
-        name=Path(paths[0]).stem, scene=scene, terrain=terrain, clearance=clearance, preference=preference,
-        bounds=bounds, crs=grid_crs, origin_grid=origin, geoid_separation_m=None,
+        name=name, scene=scene, terrain=terrain, clearance=clearance, preference=preference,
+        bounds=bounds, crs=crs, origin_grid=origin_grid, geoid_separation_m=None,
     )  # fmt: skip
 
 
@@ -242,7 +265,7 @@ def _crowns(points: Float64Array, height: Float64Array, rng: np.random.Generator
 
 def _free(
     local: Float64Array, height: Float64Array, loose: BoolArray, roof: BoolArray, seen: BoolArray, bounds: Bounds,
-    cell_m: float,
+    cell_m: float, least_share: float,
 ) -> tuple[Raster, Raster]:  # fmt: skip
     """Return clearance and preference on metre cells."""
     rows, columns = round(bounds.max_y - bounds.min_y), round(bounds.max_x - bounds.min_x)
@@ -259,7 +282,7 @@ def _free(
     np.add.at(counts, (row, column), 1)
     obstacles |= counts >= 2
     clearance, preference = free_space(
-        obstacles, np.ones_like(obstacles), bounds.min_x, bounds.max_y, _FREE_CELL_M, least_share=0.999
+        obstacles, np.ones_like(obstacles), bounds.min_x, bounds.max_y, _FREE_CELL_M, least_share=least_share
     )
     # Wider than any canal: not surveyed. A scan from its edge would show half a place.
     unseen = np.ones((rows, columns), dtype=np.bool_)

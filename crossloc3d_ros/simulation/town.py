@@ -23,19 +23,18 @@ from numba import njit
 from crossloc3d_ros.clouds.raster import Raster
 from crossloc3d_ros.errors import ConfigError
 from crossloc3d_ros.simulation import mesh
-from crossloc3d_ros.simulation.families import FAMILIES, Family, draw_block, draw_street
-from crossloc3d_ros.simulation.layout import BUSH, CONIFER, Layout, Plan, Rect, Warp, draw_streets, draw_warp
+from crossloc3d_ros.simulation.families import FAMILIES, FAMILIES_BY_SEED, Family, draw_block, draw_street
+from crossloc3d_ros.simulation.layout import BUSH, CONIFER, Layout, Plan, Rect, Warp, draw_belt, draw_streets, draw_warp
 from crossloc3d_ros.simulation.scene import Label
 from crossloc3d_ros.simulation.world import Bounds, World, free_space
 from crossloc3d_ros.types import BoolArray, Float64Array
 
 _MARGIN_M = 60.0
 """How far the town goes on beyond its bounds, so that a robot near the border sees something."""
-_TERRAIN_CELL_M = 3.0
 _FREE_CELL_M = 1.0
 _CHANGE = {"building": 0.012, "small": 0.03, "tree": 0.03}
 """Share of the things that are absent at any one epoch."""
-_OPEN_BLOCKS = ("square", "car_park")
+_OPEN_BLOCKS = ("square", "car_park", "containers", "basin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +59,12 @@ class Town(World):
 def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch: int = 0) -> Town:
     """Return the town of a seed.
 
-    `family` one of `families.FAMILIES`, or None: chosen by the seed. `size_m` side of the square that may be surveyed
-    and driven, centred on the local zero. Raises ConfigError for an unknown family or an impossible size.
+    `family` one of `families.FAMILIES`, or None: chosen by the seed from `FAMILIES_BY_SEED`. `size_m` side of the
+    square that may be surveyed and driven, centred on the local zero. Raises ConfigError for an unknown family or an
+    impossible size.
     """
     if family is None:
-        family = sorted(FAMILIES)[int(_generator(seed, 0).integers(len(FAMILIES)))]
+        family = FAMILIES_BY_SEED[int(_generator(seed, 0).integers(len(FAMILIES_BY_SEED)))]
     if family not in FAMILIES:
         raise ConfigError(f"unknown family '{family}'; known are: {', '.join(sorted(FAMILIES))}")
     if not 100.0 <= size_m <= 5000.0:
@@ -79,7 +79,7 @@ def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch
     layout: Layout = style.layouts[int(rng.integers(len(style.layouts)))]
     warp = draw_warp(layout, rng)
     plan, blocks, avenue = _draw_plan(style, warp, layout, reach, rng)
-    relief = _Relief.draw(_generator(seed, 2), flat=family in ("old_town", "industry"))
+    relief = _Relief.draw(_generator(seed, 2), flat=style.flat)
     parts = _Parts.of(plan, warp, relief, reach, seed, epoch)
 
     cells = math.ceil(2 * reach / _FREE_CELL_M)
@@ -103,8 +103,10 @@ def make_town(seed: int, family: str | None = None, size_m: float = 600.0, epoch
     _fill_quads(cleared, avenue, -reach, reach, _FREE_CELL_M, 0.0)
     clearance, preference = free_space(obstacles, ~blocked | cleared, -reach, reach, _FREE_CELL_M)
 
-    terrain = relief.raster(reach + _TERRAIN_CELL_M)
-    scene = mesh.scene_from([_ground(relief, reach, parts.water), *parts.meshes(relief, seed, epoch)])
+    terrain = relief.raster(reach + 3.0)
+    scene = mesh.scene_from(
+        [_ground(relief, reach, parts.water, style.ground_cell_m), *parts.meshes(relief, seed, epoch)]
+    )
     # Every town lies somewhere in UTM zone 31N, far enough from the others for maps not to overlap.
     origin = np.array([420_000.0 + 2_000.0 * (seed % 80), 5_400_000.0 + 2_000.0 * (seed // 80 % 100), 0.0])
     return Town(
@@ -125,7 +127,11 @@ def _draw_plan(
     """Return the plan, the local quads (K, 4, 2) of the blocks that are not open ground, and those of an avenue."""
     extent = 1.5 * reach
     jitter = style.jitter * (0.4 if layout == "grid" else 1.0)
-    blocks, streets = draw_streets(Rect(-extent, -extent, extent, extent), style.block_m, style.street_m, jitter, rng)
+    square = Rect(-extent, -extent, extent, extent)
+    if style.belt is None:
+        blocks, streets = draw_streets(square, style.block_m, style.street_m, jitter, rng)
+    else:
+        blocks, streets = draw_belt(square, style.belt, rng)
     plan = Plan()
     kinds, shares = list(style.blocks), np.array(list(style.blocks.values()))
     # Some towns lean towards one kind of block, as real quarters do.
@@ -146,7 +152,7 @@ def _draw_plan(
     for street in streets:
         draw_street(plan, street, style, np.random.Generator(np.random.PCG64(rng.integers(2**63))))
     avenue = np.zeros((0, 4, 2))
-    if rng.random() < (0.3 if layout == "grid" else 0.55):
+    if style.avenues and rng.random() < (0.3 if layout == "grid" else 0.55):
         avenue = warp(_cut_avenue(plan, extent, rng))
     return plan, np.concatenate(closed) if closed else np.zeros((0, 4, 2)), avenue
 
@@ -406,19 +412,19 @@ def grow_trees(
     return [trunks, mesh.leaves(points, leaf[tree], Label.VEGETATION, rng)]
 
 
-def _ground(relief: _Relief, reach: float, water: Float64Array) -> mesh.Mesh:
+def _ground(relief: _Relief, reach: float, water: Float64Array, cell_m: float) -> mesh.Mesh:
     """Return the terrain, with canals and ponds sunk into it."""
     far = reach + 60.0
-    count = math.ceil(2 * far / _TERRAIN_CELL_M) + 1
-    line = -far + np.arange(count) * _TERRAIN_CELL_M
+    count = math.ceil(2 * far / cell_m) + 1
+    line = -far + np.arange(count) * cell_m
     heights = relief(np.stack(np.meshgrid(line, line), -1))
-    ground = mesh.height_grid(heights, -far, -far, _TERRAIN_CELL_M, Label.GROUND)
+    ground = mesh.height_grid(heights, -far, -far, cell_m, Label.GROUND)
     if len(water) == 0:
         return ground
     wet = np.zeros((count, count), dtype=np.bool_)
-    edge = far + _TERRAIN_CELL_M / 2
+    edge = far + cell_m / 2
     # Cells centred on the posts; flipped, because the filler's row 0 lies in the north.
-    _fill_quads(wet, water, -edge, -edge + count * _TERRAIN_CELL_M, _TERRAIN_CELL_M, 0.0)
+    _fill_quads(wet, water, -edge, -edge + count * cell_m, cell_m, 0.0)
     sunk = np.flipud(wet).ravel()
     vertices = ground.vertices.copy()
     vertices[sunk, 2] -= 1.6

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +22,12 @@ from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import MountingConfig, PlacesConfig, PreprocessingConfig, ScanConfig, to_dict
 from crossloc3d_ros.errors import ConfigError, TrainingError
-from crossloc3d_ros.simulation.families import FAMILIES
+from crossloc3d_ros.simulation.families import FAMILIES, HELD_OUT_FAMILIES, TRAINING_FAMILIES
+from crossloc3d_ros.simulation.real_world import world_from_points
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import Town, make_town
 from crossloc3d_ros.simulation.vlp16 import Vlp16
+from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.training.shards import (
     MANIFEST,
     TRAINING,
@@ -39,11 +42,14 @@ from crossloc3d_ros.training.shards import (
 )
 from crossloc3d_ros.types import Float32Array, Float64Array, Scan
 
-GROUND_CLASS = 2
+UNCLASSIFIED, GROUND_CLASS, BUILDING_CLASS, WATER_CLASS = 1, 2, 6, 9
 _SEEDS_A_SET = 100_000
 _VALIDATION_SEEDS = 50_000
 _DIAGONAL = 2.0**0.5 + 0.01
 _MOST_SCAN_POINTS = 30_000
+_SURFACE_STREAM = 11
+_SURFACE_CLEARANCE_M = 1.5
+"""As a route through a real survey keeps by default."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,11 @@ class Made:
 
 
 def plan_towns(seed: int, towns: int, validation_towns: int, families: Sequence[str]) -> list[TownTask]:
-    """Return the towns of a set, validation first, families in turns; more towns extend a set without changing it."""
+    """Return the towns of a set, validation first, families in turns; more towns extend a set without changing it.
+
+    A family may be named more than once; without any, all are taken but those held out for the benchmark. Raises
+    ConfigError for unknown families and for a held-out one among those to learn from.
+    """
     if towns < 0 or validation_towns < 0 or max(towns, validation_towns) > _VALIDATION_SEEDS:
         raise ConfigError(
             f"a set holds 0 to {_VALIDATION_SEEDS:,} towns of each role, asked for {towns} and {validation_towns}"
@@ -75,7 +85,10 @@ def plan_towns(seed: int, towns: int, validation_towns: int, families: Sequence[
     unknown = sorted(set(families) - set(FAMILIES))
     if unknown:
         raise ConfigError(f"unknown families: {', '.join(unknown)}; known are: {', '.join(sorted(FAMILIES))}")
-    names = list(families) or sorted(FAMILIES)
+    held_out = sorted(set(families) & set(HELD_OUT_FAMILIES))
+    if held_out and towns:
+        raise ConfigError(f"held out for the benchmark, not to be learned from: {', '.join(held_out)}")
+    names = families or TRAINING_FAMILIES
     tasks = []
     for role, count, first in ((VALIDATION, validation_towns, _VALIDATION_SEEDS), (TRAINING, towns, 0)):
         for i in range(count):
@@ -100,6 +113,7 @@ def make_places(
 
     A folder that holds places of other settings raises TrainingError. Stopped at any moment, the next call goes on.
     """
+    config = dataclasses.replace(config, families=config.families or TRAINING_FAMILIES)
     tasks = plan_towns(seed, towns, validation_towns, config.families)
     settings = {
         "seed": seed,
@@ -159,6 +173,24 @@ def make_town_places(
     return _training_town(task, driven, poses, above_ground, config, preprocessing, rng)
 
 
+def surveyed_world(town: Town, spacing_m: float) -> World:
+    """Return what an airborne survey shows of a town as a world to drive through, as if it were a real survey.
+
+    Half of the towns have no points of class building, as some national surveys, so that roofs are guessed.
+    """
+    rng = np.random.default_rng([town.seed, town.epoch, _SURFACE_STREAM])
+    survey = fly(town, SurveyConfig(spacing_m=spacing_m), rng)
+    classes = survey.classification
+    if rng.random() < 0.5:
+        classes = np.where(classes == BUILDING_CLASS, np.uint8(UNCLASSIFIED), classes)
+    # A water's few echoes would make ground of it.
+    dry = classes != WATER_CLASS
+    return world_from_points(
+        survey.points[dry], classes[dry], town.bounds, name=town.name, crs=town.crs, origin_grid=town.origin_grid,
+        seed=town.seed, least_share=0.25,
+    )  # fmt: skip
+
+
 def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generator) -> Float64Array:
     """Fly over a town and return the points (N, 3) x, y and height above the terrain, as the map's builder has them.
 
@@ -171,13 +203,13 @@ def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generat
 
 
 def scan_town(
-    town: Town, T_world_base: Float64Array, config: PlacesConfig, rng: np.random.Generator
+    world: World, T_world_base: Float64Array, config: PlacesConfig, rng: np.random.Generator
 ) -> tuple[Scan, ScanConfig, Float64Array | None]:
-    """Scan a town from a pose (4, 4) of the robot; return the scan, its settings and the IMU's "up", at times none."""
+    """Scan a world from a pose (4, 4) of the robot; return the scan, its settings and the IMU's "up", at times none."""
     mounting = MountingConfig(z_m=float(rng.uniform(*config.sensor_height_m)))
     T_base_lidar = mounting_matrix(mounting)
     twist = np.array([rng.uniform(0.0, 2.0), 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5)])
-    scan = Vlp16().scan(town.scene, T_world_base @ T_base_lidar, rng, twist).as_scan()
+    scan = Vlp16().scan(world.scene, T_world_base @ T_base_lidar, rng, twist).as_scan()
     up = None
     if rng.random() < config.imu_share:
         up = T_world_base[2, :3] + rng.normal(0.0, 0.004, 3)
@@ -191,11 +223,14 @@ def _training_town(
     # As far as the corners of a turned square, and with every point: the patch is made when the heading is known.
     reach_m = preprocessing.scan_half_extent_m * _DIAGONAL
     whole = dataclasses.replace(preprocessing, scan_half_extent_m=reach_m, n_points=_MOST_SCAN_POINTS)
+    worlds: list[World] = [driven] * len(poses)
+    if config.surface_share > 0:
+        poses, worlds = _partly_surveyed(driven, poses, config, preprocessing)
     places: list[Float64Array] = []
     headings: list[float] = []
     scans: list[Float32Array] = []
-    for pose in poses:
-        scan, scan_config, up = scan_town(driven, pose, config, rng)
+    for world, pose in zip(worlds, poses, strict=True):
+        scan, scan_config, up = scan_town(world, pose, config, rng)
         patch = prepare_scan(scan, scan_config, whole, up).patch
         if patch is not None:
             places.append(pose[:2, 3])
@@ -213,6 +248,31 @@ def _training_town(
         scan_starts=np.cumsum([0, *(len(scan) for scan in scans)]).astype(np.int64),
         survey_points=above,
     )
+
+
+def _partly_surveyed(
+    driven: Town, poses: Float64Array, config: PlacesConfig, preprocessing: PreprocessingConfig
+) -> tuple[Float64Array, list[World]]:
+    """Return poses, some of them chosen anew in what a survey shows of the town, and each one's world."""
+    # A stream of its own: the other scans' places do not change with the share.
+    rng = np.random.default_rng([driven.seed, _SURFACE_STREAM])
+    chosen = np.flatnonzero(rng.random(len(poses)) < config.surface_share)
+    worlds: list[World] = [driven] * len(poses)
+    if len(chosen) == 0:
+        return poses, worlds
+    surface = surveyed_world(driven, config.survey_spacing_m)
+    border_m = preprocessing.half_extent_m + 10.0
+    try:
+        moved = surface.sample_poses(
+            len(chosen), rng, clearance_m=_SURFACE_CLEARANCE_M, border_m=border_m, tilt_deg=config.tilt_deg
+        )
+    except ValueError:  # the survey shows no room to drive
+        return poses, worlds
+    poses = poses.copy()
+    poses[chosen] = moved
+    for i in chosen:
+        worlds[i] = surface
+    return poses, worlds
 
 
 def _validation_town(
@@ -261,7 +321,9 @@ def _manifest(settings: dict[str, object], tasks: Sequence[TownTask], made: dict
     return Manifest(settings, tuple(made[task.file] for task in tasks if task.file in made))
 
 
-def _check_same(output: Path, before: dict[str, object], now: dict[str, object]) -> None:
+def _check_same(output: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
+    # A setting that came later has its default in sets made before.
+    before["places"] = to_dict(PlacesConfig()) | before.get("places", {})
     for key in ("seed", "places", "preprocessing"):
         if json.dumps(before.get(key), sort_keys=True) != json.dumps(now[key], sort_keys=True):
             raise TrainingError(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.errors import ConfigError
-from crossloc3d_ros.simulation.families import FAMILIES
+from crossloc3d_ros.simulation.families import FAMILIES, FAMILIES_BY_SEED, HELD_OUT_FAMILIES, TRAINING_FAMILIES
 from crossloc3d_ros.simulation.scene import Label
 from crossloc3d_ros.simulation.town import Town, make_town
 
@@ -25,6 +25,33 @@ def test_a_seed_makes_the_same_town_in_another_process(town: Town) -> None:
     program = "from crossloc3d_ros.simulation.town import make_town; print(make_town(11, 'suburb', 240.0).digest())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip().splitlines()[-1] == town.digest()
+
+
+FROZEN = {
+    ("campus", 0): "5e83bdfa799cfc68", ("campus", 1): "8d2c72211bd9422b",
+    ("estate", 0): "d368995e31568f2b", ("estate", 1): "3d2e29a1fa25b13a",
+    ("industry", 0): "bb9ea6487be2d68e", ("industry", 1): "c580f428af4be924",
+    ("old_town", 0): "af3230732ef02c16", ("old_town", 1): "8e3cc2a56632a1a7",
+    ("park_edge", 0): "ec7d4b49026f947e", ("park_edge", 1): "346fd7f36d9177c7",
+    ("suburb", 0): "30fea5818bfed1b7", ("suburb", 1): "2da1889b95ddd198",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("family", "epoch"), FROZEN)
+def test_towns_that_weights_have_learned_from_stay_what_they_were(family: str, epoch: int) -> None:
+    """A model card names seeds: with them anybody makes the same training towns again."""
+    assert make_town(100_007, family, 160.0, epoch).digest()[:16] == FROZEN[family, epoch]
+
+
+def test_a_seed_alone_stays_the_same_family() -> None:
+    assert [make_town(seed, None, 100.0).family for seed in (5, 6, 7)] == ["park_edge", "industry", "suburb"]
+    assert set(FAMILIES_BY_SEED) == {family for family, _ in FROZEN}
+
+
+def test_held_out_families_are_not_for_training() -> None:
+    assert len(HELD_OUT_FAMILIES) >= 2
+    assert not set(HELD_OUT_FAMILIES) & set(TRAINING_FAMILIES)
+    assert set(HELD_OUT_FAMILIES) | set(TRAINING_FAMILIES) == set(FAMILIES)
 
 
 def test_seeds_make_different_towns(town: Town) -> None:

@@ -10,7 +10,10 @@ import pytest
 
 from crossloc3d_ros.config import PlacesConfig, PreprocessingConfig
 from crossloc3d_ros.errors import ConfigError, TrainingError
-from crossloc3d_ros.training.places import make_places, make_town_places, plan_towns
+from crossloc3d_ros.simulation.families import FAMILIES, HELD_OUT_FAMILIES
+from crossloc3d_ros.simulation.scene import Label
+from crossloc3d_ros.simulation.town import make_town
+from crossloc3d_ros.training.places import make_places, make_town_places, plan_towns, surveyed_world
 from crossloc3d_ros.training.sampling import PointField
 from crossloc3d_ros.training.shards import (
     MANIFEST,
@@ -94,6 +97,52 @@ def test_places_of_other_settings_are_refused(made: Path) -> None:
     other = dataclasses.replace(SMALL, scans=5)
     with pytest.raises(TrainingError, match="another 'places'"):
         make_places(made, towns=1, validation_towns=1, seed=3, config=other, preprocessing=PREPROCESSING)
+
+
+def test_the_manifest_names_every_family_and_none_that_is_held_out(tmp_path: Path) -> None:
+    config = dataclasses.replace(SMALL, families=())
+    manifest = make_places(tmp_path, towns=0, validation_towns=0, seed=3, config=config, preprocessing=PREPROCESSING)
+    families = manifest.settings["places"]["families"]
+    assert sorted(families) == sorted(set(FAMILIES) - set(HELD_OUT_FAMILIES))
+    assert {task.family for task in plan_towns(1, 50, 10, ())} == set(families)
+
+
+def test_a_held_out_family_is_not_learned_from() -> None:
+    with pytest.raises(ConfigError, match=r"held out for the benchmark.*village"):
+        plan_towns(1, 1, 0, ("suburb", "village"))
+
+
+def test_a_family_may_be_named_twice() -> None:
+    assert [task.family for task in plan_towns(1, 4, 0, ("suburb", "campus", "suburb"))] == [
+        "suburb", "campus", "suburb", "suburb",
+    ]  # fmt: skip
+
+
+def test_scans_in_a_surveyed_surface_leave_the_others_as_they_are() -> None:
+    """With a share of them every scan is still a place of the town, and the rest are those without the share."""
+    task = plan_towns(3, 1, 0, ("suburb",))[0]
+    config = dataclasses.replace(SMALL, town_size_m=300.0, scans=8)
+    exact = make_town_places(task, config, PREPROCESSING)
+    mixed = make_town_places(task, dataclasses.replace(config, surface_share=0.5), PREPROCESSING)
+    assert isinstance(exact, TrainingTown) and isinstance(mixed, TrainingTown)
+    assert np.array_equal(exact.survey_points, mixed.survey_points)
+    kept = {tuple(place) for place in exact.scan_xy_m} & {tuple(place) for place in mixed.scan_xy_m}
+    assert 0 < len(kept) < len(exact)
+
+
+def test_a_surveyed_town_stands_where_the_town_stands() -> None:
+    town = make_town(300_000, "suburb", 200.0)
+    surface = surveyed_world(town, 0.5)
+    poses = surface.sample_poses(40, np.random.default_rng(0), border_m=30.0, clearance_m=1.5, tilt_deg=0.0)
+    np.testing.assert_allclose(poses[:, 2, 3], town.terrain_height(poses[:, :2, 3]), atol=0.3)
+    rng = np.random.default_rng(1)
+    over = np.column_stack([rng.uniform(-90, 90, (3000, 2)), np.full(3000, 200.0)]).astype(np.float32)
+    down = np.tile(np.float32([[0, 0, -1]]), (3000, 1))
+    exact, seen = town.scene.cast(over, down), surface.scene.cast(over, down)
+    roofs = exact.label == Label.BUILDING
+    near = np.abs(exact.distance_m - seen.distance_m) < 0.6
+    assert near[roofs].mean() > 0.75
+    assert near[exact.label == Label.GROUND].mean() > 0.9
 
 
 def test_an_unknown_family_is_named() -> None:
