@@ -87,7 +87,7 @@ setup(
         "rosbags>=0.10",
         "safetensors>=0.4",
         "scipy>=1.11",
-        "torch>=2.2",
+        "torch>=2.4",
         "utm>=0.7",
     ],
     extras_require={

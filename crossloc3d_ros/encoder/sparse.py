@@ -142,8 +142,8 @@ def search_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> Kernel
 
 
 def _accumulate(x: Tensor, weight: Tensor, in_rows: Tensor, out_rows: Tensor, first: tuple[int, ...], n: int) -> Tensor:
-    """Return `out[o] = sum_k x[i] @ weight[k]` over the pairs of each kernel k; out (n, Cout)."""
-    out = x.new_zeros(n, weight.shape[2])
+    """Return `out[o] = sum_k x[i] @ weight[k]` over the pairs of each kernel k; out (n, Cout), at least float32."""
+    out = x.new_zeros(n, weight.shape[2], dtype=torch.promote_types(x.dtype, torch.float32))
     if _is_compiled(x, weight):
         bounds = np.asarray(first)
         kernels.gather_product(
@@ -159,13 +159,14 @@ def _accumulate(x: Tensor, weight: Tensor, in_rows: Tensor, out_rows: Tensor, fi
     for k in range(len(first) - 1):
         begin, end = first[k], first[k + 1]
         if begin < end:
-            out.index_add_(0, out_rows[begin:end], x.index_select(0, in_rows[begin:end]) @ weight[k])
+            out.index_add_(0, out_rows[begin:end], (x.index_select(0, in_rows[begin:end]) @ weight[k]).to(out.dtype))
     return out
 
 
 def _weight_gradient(x: Tensor, grad: Tensor, weight: Tensor, pairs: KernelMap) -> Tensor:
-    """Return `sum x[i].T @ grad[o]` over the pairs of each kernel; the shape of the weight."""
-    out = torch.zeros_like(weight, memory_format=torch.contiguous_format)
+    """Return `sum x[i].T @ grad[o]` over the pairs of each kernel; the shape of the weight, at least float32."""
+    wide = torch.promote_types(weight.dtype, torch.float32)
+    out = torch.zeros_like(weight, dtype=wide, memory_format=torch.contiguous_format)
     if _is_compiled(x, weight):
         kernels.gather_outer(
             x.detach().contiguous().numpy(),
@@ -180,7 +181,7 @@ def _weight_gradient(x: Tensor, grad: Tensor, weight: Tensor, pairs: KernelMap) 
         begin, end = pairs.first[k], pairs.first[k + 1]
         if begin < end:
             inputs = x.index_select(0, pairs.in_rows[begin:end])
-            torch.mm(inputs.t(), grad.index_select(0, pairs.out_rows[begin:end]), out=out[k])
+            out[k] = inputs.t() @ grad.index_select(0, pairs.out_rows[begin:end])
     return out
 
 
@@ -192,6 +193,9 @@ def _is_compiled(x: Tensor, weight: Tensor) -> bool:
 class _SparseConvolution(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, pairs: KernelMap) -> Tensor:
+        if torch.is_autocast_enabled(x.device.type):  # products in the narrow type, sums in float32
+            narrow = torch.get_autocast_dtype(x.device.type)
+            x, weight = x.to(narrow), weight.to(narrow)
         ctx.save_for_backward(x, weight)
         ctx.pairs = pairs
         return _accumulate(x, weight, pairs.in_rows, pairs.out_rows, pairs.first, pairs.n_outputs)
@@ -201,7 +205,7 @@ class _SparseConvolution(torch.autograd.Function):
         (grad,) = grads
         x, weight = ctx.saved_tensors
         pairs: KernelMap = ctx.pairs
-        grad = grad.contiguous()
+        grad = grad.to(x.dtype).contiguous()
         grad_x = grad_weight = None
         if ctx.needs_input_grad[0]:
             transposed = weight.transpose(1, 2).contiguous()

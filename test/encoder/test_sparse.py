@@ -111,3 +111,21 @@ def test_the_vector_exponential_is_accurate() -> None:
     expected = np.exp(logits.astype(np.float64) - 20)
     expected /= expected.sum()
     assert np.abs(row / expected - 1).max() < 1e-5
+
+
+def test_under_autocast_products_are_narrow_and_sums_are_not() -> None:
+    grid = voxelize(clouds(2, 500, 300), 0.2)
+    pairs = grid.kernel_map(3)
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(len(grid.coords), 16, generator=generator, requires_grad=True)
+    weight = torch.randn(27, 16, 32, generator=generator, requires_grad=True)
+    grad = torch.randn(len(grid.coords), 32, generator=generator)
+    found = []
+    for narrow in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=narrow):
+            out = sparse_convolution(x, weight, pairs)
+        found.append((out.detach(), *torch.autograd.grad(out, (x, weight), grad)))
+    for exact, rounded in zip(*found, strict=True):
+        assert rounded.dtype == torch.float32
+        error = float((exact - rounded).norm() / exact.norm())
+        assert 0.0 < error < 0.01

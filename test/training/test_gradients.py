@@ -83,3 +83,14 @@ def test_the_running_statistics_move_once_a_chunk(batch: Batch, tiny: TrainConfi
     batch_loss(model, make_criterion(config), batch, config)  # type: ignore[arg-type]
     counts = {int(m.num_batches_tracked) for m in model.modules() if isinstance(m, nn.BatchNorm1d)}
     assert counts == {3}
+
+
+def test_the_network_learns_under_autocast(batch: Batch, tiny: TrainConfig) -> None:
+    torch.manual_seed(0)
+    model = make_network(tiny.model)
+    _, expected = gradients(model, batch, tiny)
+    with torch.autocast("cpu", torch.bfloat16):
+        _, found = gradients(model, batch, tiny)
+    flat = [torch.cat([value.float().flatten() for value in side.values()]) for side in (expected, found)]
+    assert torch.isfinite(flat[1]).all()
+    assert float(torch.nn.functional.cosine_similarity(*flat, dim=0)) > 0.7
