@@ -15,6 +15,7 @@ Surveys without building class (AHN2) have their roofs told from crowns by what 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,38 @@ _EDGE_M = 25.0
 """How far from the end of the survey a robot keeps."""
 
 
+@dataclass(frozen=True, eq=False)
+class LocalSurvey:
+    """A survey in memory."""
+
+    name: str
+    points: Float64Array
+    """(N, 3) metres from `origin_grid`."""
+    classes: UInt8Array
+    """(N,) ASPRS."""
+    bounds: Bounds
+    crs: str
+    """UTM zone of the area."""
+    origin_grid: Float64Array
+    """(3,) easting, northing, height in `crs`."""
+
+
+def read_survey(
+    paths: Sequence[str | Path],
+    *,
+    crs: str | None = None,
+    progress: Callable[[str, float, float, str], None] | None = None,
+) -> LocalSurvey:
+    """Read a survey whole, without its noise; the arguments and errors are those of `world_from_survey`."""
+    points, classes, grid_crs = _read(paths, crs, progress)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if float(np.prod(high[:2] - low[:2])) > 9e6:
+        raise AerialDataError("the survey covers more than 9 square kilometres; name fewer files")
+    origin = np.array([np.round((low[0] + high[0]) / 2), np.round((low[1] + high[1]) / 2), 0.0])
+    bounds = Bounds(*_snap(low[:2] - origin[:2], high[:2] - origin[:2]))
+    return LocalSurvey(Path(paths[0]).stem, points - origin, classes, bounds, grid_crs, origin)
+
+
 def world_from_survey(
     paths: Sequence[str | Path],
     *,
@@ -54,15 +87,10 @@ def world_from_survey(
     for a few square kilometres. Raises AerialDataError for unusable files, for an area without ground points and for
     one that is too large.
     """
-    points, classes, grid_crs = _read(paths, crs, progress)
-    low, high = points.min(axis=0), points.max(axis=0)
-    if float(np.prod(high[:2] - low[:2])) > 9e6:
-        raise AerialDataError("the survey covers more than 9 square kilometres; name fewer files")
-    origin = np.array([np.round((low[0] + high[0]) / 2), np.round((low[1] + high[1]) / 2), 0.0])
-    bounds = Bounds(*_snap(low[:2] - origin[:2], high[:2] - origin[:2]))
+    survey = read_survey(paths, crs=crs, progress=progress)
     return world_from_points(
-        points - origin, classes, bounds, name=Path(paths[0]).stem, crs=grid_crs, origin_grid=origin,
-        cell_m=cell_m, seed=seed, progress=progress,
+        survey.points, survey.classes, survey.bounds, name=survey.name, crs=survey.crs,
+        origin_grid=survey.origin_grid, cell_m=cell_m, seed=seed, progress=progress,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from crossloc3d_ros.simulation.real_world import world_from_points
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import Town, make_town
 from crossloc3d_ros.simulation.vlp16 import Vlp16
-from crossloc3d_ros.simulation.world import World
+from crossloc3d_ros.simulation.world import Bounds, World
 from crossloc3d_ros.training.shards import (
     MANIFEST,
     TRAINING,
@@ -40,7 +40,7 @@ from crossloc3d_ros.training.shards import (
     write_manifest,
     write_town,
 )
-from crossloc3d_ros.types import Float32Array, Float64Array, Scan
+from crossloc3d_ros.types import Float32Array, Float64Array, Scan, UInt8Array
 
 UNCLASSIFIED, GROUND_CLASS, BUILDING_CLASS, WATER_CLASS = 1, 2, 6, 9
 _SEEDS_A_SET = 100_000
@@ -48,7 +48,7 @@ _VALIDATION_SEEDS = 50_000
 _DIAGONAL = 2.0**0.5 + 0.01
 _MOST_SCAN_POINTS = 30_000
 _SURFACE_STREAM = 11
-_SURFACE_CLEARANCE_M = 1.5
+SURFACE_CLEARANCE_M = 1.5
 """As a route through a real survey keeps by default."""
 
 
@@ -122,15 +122,7 @@ def make_places(
         "places": to_dict(config),
         "preprocessing": to_dict(preprocessing),
     }
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainingError(f"cannot make {output}: {error.strerror or error}") from error
-    made: dict[str, TownEntry] = {}
-    if (output / MANIFEST).exists():
-        before = read_manifest(output)
-        _check_same(output, dict(before.settings), settings)
-        made = {town.file: town for town in before.towns if (output / town.file).exists()}
+    made = already_made(output, settings)
     missing = [task for task in tasks if task.file not in made]
     started = time.monotonic()
     for done, entry in enumerate(_make_all(output, missing, config, preprocessing, workers), start=1):
@@ -141,6 +133,19 @@ def make_places(
     manifest = _manifest(settings, tasks, made)
     write_manifest(output, manifest)
     return manifest
+
+
+def already_made(output: Path, settings: Mapping[str, object]) -> dict[str, TownEntry]:
+    """Make the folder and return the towns that it holds by file; TrainingError where it holds others' places."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainingError(f"cannot make {output}: {error.strerror or error}") from error
+    if not (output / MANIFEST).exists():
+        return {}
+    before = read_manifest(output)
+    _check_same(output, dict(before.settings), settings)
+    return {town.file: town for town in before.towns if (output / town.file).exists()}
 
 
 def make_town_file(folder: Path, task: TownTask, config: PlacesConfig, preprocessing: PreprocessingConfig) -> TownEntry:
@@ -170,7 +175,10 @@ def make_town_places(
     poses = driven.sample_poses(count, rng, border_m=border_m, tilt_deg=config.tilt_deg)
     if validating:
         return _validation_town(task, driven, poses, above_ground, config, preprocessing, rng)
-    return _training_town(task, driven, poses, above_ground, config, preprocessing, rng)
+    worlds: list[World] = [driven] * len(poses)
+    if config.surface_share > 0:
+        poses, worlds = _partly_surveyed(driven, poses, config, preprocessing)
+    return training_town(task.file, poses, worlds, above_ground, config, preprocessing, rng)
 
 
 def surveyed_world(town: Town, spacing_m: float) -> World:
@@ -197,9 +205,13 @@ def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generat
     The terrain is made from the points of class ground, not taken from the simulator: the same errors as in a map.
     """
     survey = fly(town, SurveyConfig(spacing_m=config.survey_spacing_m), rng)
-    terrain = terrain_raster(survey.points, survey.classification == GROUND_CLASS, town.bounds, config.cell_m)
-    heights = survey.points[:, 2] - terrain.sample(survey.points[:, 0], survey.points[:, 1])
-    return np.column_stack([survey.points[:, :2], heights])
+    return above_terrain(survey.points, survey.classification, town.bounds, config.cell_m)
+
+
+def above_terrain(points: Float64Array, classes: UInt8Array, bounds: Bounds, cell_m: float) -> Float64Array:
+    """Return points (N, 3) with the height above the terrain, made from those of class ground, for z."""
+    terrain = terrain_raster(points, classes == GROUND_CLASS, bounds, cell_m)
+    return np.column_stack([points[:, :2], points[:, 2] - terrain.sample(points[:, 0], points[:, 1])])
 
 
 def scan_town(
@@ -216,16 +228,14 @@ def scan_town(
     return scan, ScanConfig(mounting=mounting), up
 
 
-def _training_town(
-    task: TownTask, driven: Town, poses: Float64Array, above_ground: Float64Array, config: PlacesConfig,
+def training_town(
+    file: str, poses: Float64Array, worlds: Sequence[World], above_ground: Float64Array, config: PlacesConfig,
     preprocessing: PreprocessingConfig, rng: np.random.Generator,
 ) -> TrainingTown:  # fmt: skip
+    """Scan from poses (S, 4, 4), each in its world, and keep what has something to show beside the survey's points."""
     # As far as the corners of a turned square, and with every point: the patch is made when the heading is known.
     reach_m = preprocessing.scan_half_extent_m * _DIAGONAL
     whole = dataclasses.replace(preprocessing, scan_half_extent_m=reach_m, n_points=_MOST_SCAN_POINTS)
-    worlds: list[World] = [driven] * len(poses)
-    if config.surface_share > 0:
-        poses, worlds = _partly_surveyed(driven, poses, config, preprocessing)
     places: list[Float64Array] = []
     headings: list[float] = []
     scans: list[Float32Array] = []
@@ -241,7 +251,7 @@ def _training_town(
         kept, available = choose_points(above, len(above), preprocessing.thin_m, preprocessing.seed)
         above = kept[:available]
     return TrainingTown(
-        name=Path(task.file).stem,
+        name=Path(file).stem,
         scan_xy_m=np.array(places).reshape(-1, 2),
         scan_heading_rad=np.array(headings),
         scan_points_cm=np.rint(np.concatenate([np.empty((0, 3), np.float32), *scans])).astype(np.int16),
@@ -264,7 +274,7 @@ def _partly_surveyed(
     border_m = preprocessing.half_extent_m + 10.0
     try:
         moved = surface.sample_poses(
-            len(chosen), rng, clearance_m=_SURFACE_CLEARANCE_M, border_m=border_m, tilt_deg=config.tilt_deg
+            len(chosen), rng, clearance_m=SURFACE_CLEARANCE_M, border_m=border_m, tilt_deg=config.tilt_deg
         )
     except ValueError:  # the survey shows no room to drive
         return poses, worlds
@@ -321,10 +331,10 @@ def _manifest(settings: dict[str, object], tasks: Sequence[TownTask], made: dict
     return Manifest(settings, tuple(made[task.file] for task in tasks if task.file in made))
 
 
-def _check_same(output: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
+def _check_same(output: Path, before: dict[str, Any], now: Mapping[str, Any]) -> None:
     # A setting that came later has its default in sets made before.
     before["places"] = to_dict(PlacesConfig()) | before.get("places", {})
-    for key in ("seed", "places", "preprocessing"):
+    for key in sorted(now.keys() - {"towns", "validation_towns"}):
         if json.dumps(before.get(key), sort_keys=True) != json.dumps(now[key], sort_keys=True):
             raise TrainingError(
                 f"{output} holds places of another '{key}' ({before.get(key)}, now {now[key]}): name another folder"
