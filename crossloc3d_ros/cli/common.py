@@ -13,14 +13,16 @@ import time
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import yaml
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from crossloc3d_ros.config import from_dict
-from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.config import TrainConfig, check_value, from_dict
+from crossloc3d_ros.errors import ConfigError, CrossLocError
 
 T = TypeVar("T")
 
@@ -164,3 +166,26 @@ def read_options(kind: type[T], namespace: argparse.Namespace) -> T:
     names = {item.name for item in dataclasses.fields(typing.cast(Any, kind))}
     given = {name: value for name, value in vars(namespace).items() if name in names and value is not None}
     return from_dict(kind, given)
+
+
+def train_config(arguments: argparse.Namespace) -> TrainConfig:
+    """Return the settings of a training: the group `train` of the file `--config`, changed by the options given."""
+    config = from_dict(TrainConfig, read_yaml(arguments.config).get("train", {}), where="train.")
+    fields = {item.name: item for item in dataclasses.fields(TrainConfig)}
+    given = {name: getattr(arguments, name) for name in fields if getattr(arguments, name, None) is not None}
+    for name, value in given.items():
+        check_value(name, type(value), value, fields[name].metadata)
+    return dataclasses.replace(config, **given)
+
+
+def read_yaml(path: Path | None) -> dict[str, Any]:
+    """Return the groups `places` and `train` of a settings file; empty without a file."""
+    if path is None:
+        return {}
+    try:
+        document = yaml.safe_load(path.read_text()) or {}
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    if not isinstance(document, dict) or not document.keys() <= {"places", "train"}:
+        raise ConfigError(f"{path} must hold the groups 'places' and 'train' and nothing else")
+    return document

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 
 from crossloc3d_ros.cli import common
-from crossloc3d_ros.config import PlacesConfig, TrainConfig, check_value, from_dict
-from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.config import PlacesConfig, TrainConfig, from_dict
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +35,11 @@ def _parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="train until the budget is used")
     run.add_argument(
-        "--places", type=Path, required=True, action="append", help="folder of make-places; may be repeated"
+        "--places", type=Path, required=True, action="append",
+        help="folder of make-places, may be repeated; or a dataset, of make_dataset or a published one",
+    )  # fmt: skip
+    run.add_argument(
+        "--preset", choices=["campus", "oxford", "plain"], help="kind of a dataset (default: by its files)"
     )
     run.add_argument("--output", type=Path, required=True, help="folder of the run")
     budget = run.add_mutually_exclusive_group(required=True)
@@ -68,7 +69,7 @@ def _make_places(arguments: argparse.Namespace) -> int:
     from crossloc3d_ros.training.places import make_places
 
     console = common.console()
-    document = _read_yaml(arguments.config)
+    document = common.read_yaml(arguments.config)
     manifest = make_places(
         arguments.output,
         towns=arguments.towns,
@@ -92,9 +93,11 @@ def _run(arguments: argparse.Namespace) -> int:
     from crossloc3d_ros.training.schedule import Budget
 
     budget = Budget(minutes=arguments.budget_minutes, steps=arguments.budget_steps)
-    config = _train_config(arguments)
+    config = common.train_config(arguments)
     show = _progress(common.console())
-    trainer = Trainer(config, arguments.places, arguments.output, budget, arguments.initial, report=show)
+    trainer = Trainer(
+        config, arguments.places, arguments.output, budget, arguments.initial, arguments.preset, report=show
+    )
     validation = trainer.run(resume=arguments.resume)
     trainer.write_card()
     for recall in validation.recalls:
@@ -109,27 +112,6 @@ def _export(arguments: argparse.Namespace) -> int:
     card = export_run(arguments.run, arguments.output, arguments.places)
     print(f"{arguments.output}\n{card}")
     return 0
-
-
-def _train_config(arguments: argparse.Namespace) -> TrainConfig:
-    config = from_dict(TrainConfig, _read_yaml(arguments.config).get("train", {}), where="train.")
-    fields = {f.name: f for f in dataclasses.fields(TrainConfig)}
-    given = {name: getattr(arguments, name) for name in fields if getattr(arguments, name, None) is not None}
-    for name, value in given.items():
-        check_value(name, type(value), value, fields[name].metadata)
-    return dataclasses.replace(config, **given)
-
-
-def _read_yaml(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        return {}
-    try:
-        document = yaml.safe_load(path.read_text()) or {}
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
-    if not isinstance(document, dict) or not document.keys() <= {"places", "train"}:
-        raise ConfigError(f"{path} must hold the groups 'places' and 'train' and nothing else")
-    return document
 
 
 def _progress(console: Console) -> Any:

@@ -172,7 +172,7 @@ class ScanContext(DescriptorEncoder):
         if reach == 0:
             return maps
         turned = [np.roll(maps, step, axis=2) for step in range(-reach, reach + 1)]
-        around = np.mean(turned, axis=0, dtype=np.float32)
+        around = np.stack(turned).mean(axis=0)
         total, count = np.zeros_like(maps), np.zeros((1, maps.shape[1], 1), np.float32)
         for step in range(-reach, reach + 1):
             to, of = _overlap(maps.shape[1], step)
