@@ -13,6 +13,7 @@ many trials as there are places at least 25 m apart.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -211,9 +212,16 @@ def _bootstrap(values: Float64Array, clusters: Int64Array) -> tuple[float, float
     """Return the percentiles 2.5 and 97.5 of the mean of values (Q,) when whole clusters (Q,) are drawn by lot."""
     numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
     sums, counts = np.bincount(numbers, values), np.bincount(numbers)
-    drawn = np.random.default_rng(_SEED).multinomial(len(sums), np.full(len(sums), 1.0 / len(sums)), _RESAMPLED)
+    drawn = _draws(len(sums))
     low, high = np.percentile((drawn @ sums) / (drawn @ counts), [2.5, 97.5])
     return float(low), float(high)
+
+
+@functools.lru_cache(maxsize=16)
+def _draws(count: int) -> Float64Array:
+    """Return (resamplings, count) how often each of `count` clusters is drawn; always the same."""
+    drawn = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1.0 / count), _RESAMPLED)
+    return np.asarray(drawn, dtype=np.float64)
 
 
 def _group(name: str, chosen: BoolArray, truths: Sequence[_Truth], queries: PlaceSet, database: int) -> GroupScores:
