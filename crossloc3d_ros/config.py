@@ -161,6 +161,7 @@ class PlacesConfig:
     scans: int = option(120, "scans of each town to learn from", low=1, high=100_000)
     validation_scans: int = option(40, "scans of each town to validate on", low=1, high=100_000)
     survey_spacing_m: float = option(0.35, "distance between neighbouring pulses of a survey", low=0.05, high=5.0)
+    survey_vertical_error_m: float = option(0.1, "one sigma of a survey's heights", low=0.0, high=2.0)
     spacing_m: float = option(19.0, "distance between the centres of validation submaps", low=1.0, high=1000.0)
     cell_m: float = option(1.0, "cell of the terrain raster", low=0.1, high=10.0)
     sensor_height_m: tuple[float, float] = option((0.9, 1.6), "lowest and highest lidar above the ground", low=0.2)
