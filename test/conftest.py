@@ -123,8 +123,8 @@ class RecordedArea:
 def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
     """Write survey and drives: scans every 2 m, GNSS at 2 Hz between them, odometry at 10 Hz.
 
-    In the first drive the receiver is lost from 40 to 46 s, doubts itself from 60 to 64 s and falls silent from 80 to
-    86 s.
+    In the first drive the receiver begins at 2 s, is lost from 40 to 46 s, doubts itself from 60 to 64 s and falls
+    silent from 80 to 86 s.
     """
     from crossloc3d_ros.formats import bag
     from crossloc3d_ros.formats.las import write_laz
@@ -132,9 +132,9 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
 
     west, south, length, width, crs = 628_000.0, 5_803_000.0, 480.0, 120.0, "EPSG:32631"
     rng = np.random.default_rng(11)
-    e, n = rng.uniform(0, length, 200_000), rng.uniform(0, width, 200_000)
+    e, n = np.sort(rng.uniform(0, length, 160_000)), rng.uniform(0, width, 160_000)
     z = np.zeros_like(e)
-    for _ in range(90):
+    for _ in range(220):
         x, y, w, d = rng.uniform(0, length), rng.uniform(0, width), rng.uniform(5, 16), rng.uniform(5, 14)
         if abs(y - width / 2) > d / 2 + 6:
             z[(abs(e - x) < w / 2) & (abs(n - y) < d / 2)] = rng.uniform(3, 15)
@@ -148,22 +148,23 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
     bags, truths = [], []
     for number, (heading, lane) in enumerate(((0.0, -2.0), (np.pi, 2.0))):
         path = folder / f"drive {number}"
-        times = np.arange(0.5, 110.0, 0.5)
+        times = np.arange(0.5, 110.5, 0.5)
 
         def place(t: float, heading: float = heading, lane: float = lane) -> np.ndarray:
             along = 20.0 + speed * t if heading == 0.0 else length - 20.0 - speed * t
             return np.array([[west + along, south + width / 2 + lane, 2.0]])
 
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        pose = np.zeros(3)
         with bag.BagWriter(path) as writer:
             for tick in range(1, 1105):
                 t = tick / 10.0
                 stamp = start_ns + tick * 100_000_000
                 drifted = 0.3 + 0.002 * t  # the odometry's frame points somewhere else and drifts
-                pose = [speed * t * np.cos(0.3), speed * t * np.sin(0.3), 0.0]
+                pose += 0.1 * speed * np.array([np.cos(drifted), np.sin(drifted), 0.0])
                 quaternion = [0.0, 0.0, np.sin(drifted / 2), np.cos(drifted / 2)]
                 writer.write("/odom", bag.ODOMETRY, stamp, bag.odometry(stamp, "odom", "base_link", pose, quaternion))
-                if tick % 5 == 2 and not (number == 0 and 80.0 < t < 86.0):
+                if tick % 5 == 2 and not (number == 0 and (80.0 < t < 86.0 or t < 2.0)):
                     latitude, longitude, _ = frame.to_geographic(place(t))
                     lost = number == 0 and 40.0 < t < 46.0
                     std = 12.0 if number == 0 and 60.0 < t < 64.0 else 0.5
@@ -172,8 +173,9 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
                     )
                     writer.write("/gnss", bag.NAV_SAT_FIX, stamp, fix)
                 if tick % 5 == 0:
-                    offset = points - place(t)
-                    near = offset[np.abs(offset[:, :2]).max(axis=1) < 24.0]
+                    low, high = np.searchsorted(e, place(t)[0, 0] - west + np.array([-24.0, 24.0]))
+                    near = points[low:high] - place(t)
+                    near = near[np.abs(near[:, 1]) < 24.0]
                     xyz = np.column_stack([near[:, :2] @ turn, near[:, 2] - 1.2])
                     cloud = bag.velodyne_cloud(stamp, "velodyne", xyz, 1.0, 0, 0.0)
                     writer.write("/points", bag.POINT_CLOUD, stamp, cloud)

@@ -73,22 +73,24 @@ def cut_areas(xy_m: Float64Array, reach_m: float, shares: Mapping[str, float]) -
     best: tuple[float, int] = (0.0, 0)
     chosen: Areas | None = None
     for axis in (0, 1):
-        along = xy_m[:, axis]
-        places = np.unique(np.round(np.quantile(along, _BORDER_SHARES), 1)) if len(along) else np.empty(0)
-        for order in itertools.permutations(wanted):
-            for inner in itertools.combinations(places.tolist(), len(order) - 1):
-                borders = (-math.inf, *inner, math.inf)
-                counts = [
-                    int(((along - reach_m >= low) & (along + reach_m <= high)).sum())
-                    for low, high in itertools.pairwise(borders)
-                ]
-                fullness = min(
-                    min(1.0, count / (shares[role] * len(along))) if count else 0.0
-                    for role, count in zip(order, counts, strict=True)
+        along = np.sort(xy_m[:, axis])
+        inner = np.unique(np.round(np.quantile(along, _BORDER_SHARES), 1)) if len(along) else np.empty(0)
+        borders = np.array([-math.inf, *inner, math.inf])
+        first = np.searchsorted(along, borders + reach_m, side="left")
+        last = np.searchsorted(along, borders - reach_m, side="right")
+        between = np.maximum(last[None, :] - first[:, None], 0).tolist()
+        for cut in itertools.combinations(range(1, len(borders) - 1), len(wanted) - 1):
+            at = (0, *cut, len(borders) - 1)
+            counts = [between[low][high] for low, high in itertools.pairwise(at)]
+            if not all(counts):
+                continue
+            for order in itertools.permutations(wanted):
+                full = min(
+                    min(1.0, count / (shares[role] * len(along))) for role, count in zip(order, counts, strict=True)
                 )
-                if fullness > 0.0 and (round(fullness, 2), sum(counts)) > best:
-                    best = round(fullness, 2), sum(counts)
-                    chosen = _side_by_side(axis, order, borders)
+                if (round(full, 2), sum(counts)) > best:
+                    best = round(full, 2), sum(counts)
+                    chosen = _side_by_side(axis, order, [float(borders[i]) for i in at])
     if chosen is None:
         extent = np.ptp(xy_m, axis=0) if len(xy_m) else np.zeros(2)
         raise DatasetError(
