@@ -28,6 +28,12 @@ def _parser() -> argparse.ArgumentParser:
     places.add_argument("--towns", type=int, default=40, help="towns to learn from (default: 40)")
     places.add_argument("--validation-towns", type=int, default=6, help="towns to validate on (default: 6)")
     places.add_argument("--seed", type=int, default=1, help="another seed, other towns (default: 1)")
+    places.add_argument(
+        "--survey", nargs="+", metavar="FILE",
+        help="instead of towns: drive through the surface of this survey (LAS or LAZ), to learn the area of a map",
+    )  # fmt: skip
+    places.add_argument("--scans", type=int, default=1200, help="scans in the survey (default: 1200)")
+    places.add_argument("--crs", help="of survey files that name none, such as EPSG:28992")
     places.add_argument("--output", type=Path, required=True, help="folder; towns that lie in it already are kept")
     places.add_argument("--config", type=Path, help="YAML file of which `places` and `train` are read")
     places.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
@@ -67,23 +73,27 @@ def _parser() -> argparse.ArgumentParser:
 
 def _make_places(arguments: argparse.Namespace) -> int:
     from crossloc3d_ros.training.places import make_places
+    from crossloc3d_ros.training.survey_places import make_survey_places
 
     console = common.console()
     document = common.read_yaml(arguments.config)
-    manifest = make_places(
-        arguments.output,
-        towns=arguments.towns,
-        validation_towns=arguments.validation_towns,
-        seed=arguments.seed,
-        config=from_dict(PlacesConfig, document.get("places", {}), where="places."),
-        preprocessing=from_dict(TrainConfig, document.get("train", {}), where="train.").preprocessing,
-        workers=arguments.workers,
-        report=lambda made: console.print(
+    settings = {
+        "seed": arguments.seed,
+        "config": from_dict(PlacesConfig, document.get("places", {}), where="places."),
+        "preprocessing": from_dict(TrainConfig, document.get("train", {}), where="train.").preprocessing,
+        "report": lambda made: console.print(
             f"{made.done:4d} of {made.total} towns  {made.town.family:<12} {made.town.scans:4d} scans  "
             f"{made.town.submaps:4d} submaps  {made.town.seconds:5.1f} s  ends in {_duration(made.remaining_s)}",
             soft_wrap=True,
         ),
-    )
+    }
+    if arguments.survey:
+        manifest = make_survey_places(
+            arguments.output, arguments.survey, scans=arguments.scans, crs=arguments.crs, **settings
+        )
+    else:
+        counts = {"towns": arguments.towns, "validation_towns": arguments.validation_towns}
+        manifest = make_places(arguments.output, **counts, workers=arguments.workers, **settings)
     print(f"{arguments.output}: {sum(t.scans for t in manifest.towns):,} scans in {len(manifest.towns)} towns")
     return 0
 
