@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly, write_survey
 from crossloc3d_ros.simulation.town import make_town
+from crossloc3d_ros.simulation.traffic import TrafficConfig
 from crossloc3d_ros.simulation.world import World
 
 _SURVEY_OPTIONS = ("spacing_m", "altitude_m", "scan_angle_deg", "overlap", "horizontal_error_m", "vertical_error_m")
@@ -58,6 +60,7 @@ def _add_route(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clearance-m", type=float, default=1.5, help="kept from obstacles (default: 1.5)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag (default: mcap)")
     common.add_options(parser, DriveConfig, _DRIVE_OPTIONS)
+    common.add_options(parser, TrafficConfig)
     common.add_verbosity(parser)
 
 
@@ -107,7 +110,8 @@ def _drive(
         world, arguments.length_m, np.random.default_rng([arguments.seed, 1]),
         clearance_m=arguments.clearance_m, speed_m_s=arguments.speed_m_s,
     )  # fmt: skip
-    config = common.read_options(DriveConfig, arguments)
+    traffic = common.read_options(TrafficConfig, arguments)
+    config = dataclasses.replace(common.read_options(DriveConfig, arguments), traffic=traffic)
     return drive(world, route, bag_path, config, seed=arguments.seed, storage=arguments.storage, progress=progress)
 
 

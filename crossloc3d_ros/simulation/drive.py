@@ -29,6 +29,7 @@ from crossloc3d_ros.config import MountingConfig, option
 from crossloc3d_ros.formats import bag
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.simulation.route import Route, RouteError
+from crossloc3d_ros.simulation.traffic import Traffic, TrafficConfig
 from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float64Array
@@ -51,6 +52,7 @@ class DriveConfig:
     odometry_yaw_drift_deg_s: float = option(0.05, "one sigma of the constant yaw drift", low=0.0, high=10.0)
     imu_rate_hz: float = option(100.0, "messages a second", low=1.0, high=500.0)
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
+    traffic: TrafficConfig = field(default_factory=TrafficConfig, metadata={"text": "what moves around the robot"})
     sensor: Vlp16Config = field(default_factory=Vlp16Config, metadata={"text": "the lidar"})
 
 
@@ -95,7 +97,7 @@ def drive(
         raise RouteError(f"the route lasts {route.duration_s:.2f} s, less than one turn of the lidar")
     robot = _Robot(world, route, config, frame, start_ns)
     streams = [
-        robot.scans(np.random.default_rng([seed, 1]), progress),
+        robot.scans(seed, progress),
         robot.gnss(np.random.default_rng([seed, 2])),
         robot.odometry(np.random.default_rng([seed, 3])),
         robot.imu(np.random.default_rng([seed, 4])),
@@ -147,10 +149,9 @@ class _Robot:
         turn = Rotation.from_euler("z", -self.frame.convergence_rad(grid)[:, None])
         return self.frame.to_enu(grid), (turn * Rotation.from_matrix(poses[:, :3, :3])).as_quat()
 
-    def scans(
-        self, rng: np.random.Generator, progress: Callable[[str, float, float, str], None] | None
-    ) -> Iterator[_Event]:
+    def scans(self, seed: int, progress: Callable[[str, float, float, str], None] | None) -> Iterator[_Event]:
         config = self.config
+        rng = np.random.default_rng([seed, 1])
         sensor = Vlp16(config.sensor)
         T_base_lidar = mounting_matrix(config.mounting)
         period = 1.0 / config.sensor.rate_hz
@@ -159,11 +160,14 @@ class _Robot:
         positions, quaternions = self.enu(poses)
         latitudes, longitudes, altitudes = self.frame.to_geographic(self.world.to_grid(poses[:, :3, 3]))
         R = T_base_lidar[:3, :3]
+        # A stream of its own: with more or less traffic all else stays the same.
+        traffic = Traffic.draw(self.world, self.route, np.random.default_rng([seed, 5]), config.traffic)
         for i, time in enumerate(times):
             turn_rate = twists[i, 3:]
             velocity = twists[i, :3] + np.cross(turn_rate, T_base_lidar[:3, 3])
             twist = np.concatenate([R.T @ velocity, R.T @ turn_rate])
-            scan = sensor.scan(self.world.scene, poses[i] @ T_base_lidar, rng, twist)
+            movers = traffic.at(float(time), poses[i, :2, 3])
+            scan = sensor.scan(self.world.scene, poses[i] @ T_base_lidar, rng, twist, movers)
             stamp = self.stamp(time)
             cloud = bag.velodyne_cloud(stamp, "velodyne", scan.points, scan.intensity, scan.ring, scan.time)
             yield _Event(stamp, 0, "/velodyne_points", "sensor_msgs/msg/PointCloud2", cloud)

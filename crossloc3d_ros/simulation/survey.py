@@ -32,7 +32,7 @@ class SurveyConfig:
     scan_angle_deg: float = option(25.0, "to either side of the nadir", low=1.0, high=45.0)
     overlap: float = option(0.3, "share of a swath that its neighbour covers too", low=0.0, high=0.9)
     horizontal_error_m: float = option(0.1, "one sigma, two thirds of it common to a flight line", low=0.0, high=2.0)
-    vertical_error_m: float = option(0.1, "one sigma, half of it common to a flight line", low=0.0, high=2.0)
+    vertical_error_m: float = option(0.3, "one sigma, most of it common to a flight line", low=0.0, high=2.0)
     returns: int = option(4, "most returns of a pulse", low=1, high=15)
     heading_deg: float | None = option(None, "of the flight lines, from east counter-clockwise; none: random")
     water_return: float = option(0.08, "chance that water answers", low=0.0, high=1.0)
@@ -118,14 +118,21 @@ def fly(
     )
 
 
+_ROUGHNESS_M = 0.1
+"""Vertical error beyond which all of it is the flight line's: a survey may lie deep, but its streets are not rough."""
+
+
 def _common(config: SurveyConfig) -> Float64Array:
     horizontal = config.horizontal_error_m * 2 / 3
-    return np.array([horizontal, horizontal, 0.5 * config.vertical_error_m])
+    vertical = config.vertical_error_m
+    if vertical <= _ROUGHNESS_M:
+        return np.array([horizontal, horizontal, 0.5 * vertical])
+    return np.array([horizontal, horizontal, math.sqrt(vertical**2 - _own(config)[2] ** 2)])
 
 
 def _own(config: SurveyConfig) -> Float64Array:
     horizontal = config.horizontal_error_m * math.sqrt(1 - 4 / 9)
-    return np.array([horizontal, horizontal, math.sqrt(0.75) * config.vertical_error_m])
+    return np.array([horizontal, horizontal, math.sqrt(0.75) * min(config.vertical_error_m, _ROUGHNESS_M)])
 
 
 def _pulses(

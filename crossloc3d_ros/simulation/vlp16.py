@@ -17,6 +17,7 @@ from numba import njit
 
 from crossloc3d_ros.config import option
 from crossloc3d_ros.simulation.scene import Label, Scene
+from crossloc3d_ros.simulation.traffic import Movers
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array, Scan
 
 FIRING_ELEVATIONS_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], dtype=np.float64)
@@ -88,11 +89,12 @@ class Vlp16:
         T_world_lidar: Float64Array,
         rng: np.random.Generator,
         twist: npt.ArrayLike | None = None,
+        movers: Movers | None = None,
     ) -> VlpScan:
         """Return the turn that ends at the pose `T_world_lidar` (4, 4).
 
         `twist` (6,): velocity [m/s] and turn rate [rad/s] in the lidar frame, held during the turn; the points are then
-        distorted as a driver without motion compensation delivers them.
+        distorted as a driver without motion compensation delivers them. `movers`: what else is about at the turn's end.
         """
         config = self.config
         start_azimuth = rng.uniform(0, 2 * np.pi)
@@ -103,6 +105,8 @@ class Vlp16:
             azimuth, self._elevation, self._time, np.ascontiguousarray(T_world_lidar, dtype=np.float64), motion
         )
         hits = scene.cast(origins, directions)
+        if movers is not None:
+            hits = movers.before(hits, origins, directions, self._time)
         own_range = _body_range(beams, self._body)
         shadowed = own_range < hits.distance_m
         true_range = np.where(shadowed, own_range, hits.distance_m)

@@ -181,13 +181,13 @@ def make_town_places(
     return training_town(task.file, poses, worlds, above_ground, config, preprocessing, rng)
 
 
-def surveyed_world(town: Town, spacing_m: float) -> World:
+def surveyed_world(town: Town, config: PlacesConfig) -> World:
     """Return what an airborne survey shows of a town as a world to drive through, as if it were a real survey.
 
     Half of the towns have no points of class building, as some national surveys, so that roofs are guessed.
     """
     rng = np.random.default_rng([town.seed, town.epoch, _SURFACE_STREAM])
-    survey = fly(town, SurveyConfig(spacing_m=spacing_m), rng)
+    survey = fly(town, _flight(config), rng)
     classes = survey.classification
     if rng.random() < 0.5:
         classes = np.where(classes == BUILDING_CLASS, np.uint8(UNCLASSIFIED), classes)
@@ -199,12 +199,16 @@ def surveyed_world(town: Town, spacing_m: float) -> World:
     )  # fmt: skip
 
 
+def _flight(config: PlacesConfig) -> SurveyConfig:
+    return SurveyConfig(spacing_m=config.survey_spacing_m, vertical_error_m=config.survey_vertical_error_m)
+
+
 def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generator) -> Float64Array:
     """Fly over a town and return the points (N, 3) x, y and height above the terrain, as the map's builder has them.
 
     The terrain is made from the points of class ground, not taken from the simulator: the same errors as in a map.
     """
-    survey = fly(town, SurveyConfig(spacing_m=config.survey_spacing_m), rng)
+    survey = fly(town, _flight(config), rng)
     return above_terrain(survey.points, survey.classification, town.bounds, config.cell_m)
 
 
@@ -270,7 +274,7 @@ def _partly_surveyed(
     worlds: list[World] = [driven] * len(poses)
     if len(chosen) == 0:
         return poses, worlds
-    surface = surveyed_world(driven, config.survey_spacing_m)
+    surface = surveyed_world(driven, config)
     border_m = preprocessing.half_extent_m + 10.0
     try:
         moved = surface.sample_poses(

@@ -42,11 +42,18 @@ def test_heights_are_the_towns_within_the_errors(town: Town) -> None:
 
 
 def test_errors_have_the_size_that_was_asked_for(town: Town) -> None:
-    config = SurveyConfig(spacing_m=0.8, horizontal_error_m=0.0, vertical_error_m=0.3)
-    noisy = fly(town, config, np.random.default_rng(3))
-    above = noisy.height_above_ground(town)[noisy.classification == 2, 2]
-    assert np.std(above) == pytest.approx(0.3 * np.sqrt(0.75), rel=0.15)
-    assert abs(np.mean(above)) < 3 * 0.15
+    """A shallow error is mostly each point's own, a deep one mostly its flight line's: streets are never rough."""
+
+    def heights(error: float, seed: int, spacing: float) -> np.ndarray:
+        config = SurveyConfig(spacing_m=spacing, horizontal_error_m=0.0, vertical_error_m=error)
+        noisy = fly(town, config, np.random.default_rng(seed))
+        return noisy.height_above_ground(town)[noisy.classification == 2, 2]
+
+    for error in (0.1, 0.3):
+        assert np.std(heights(error, 3, 0.8)) == pytest.approx(0.1 * np.sqrt(0.75), rel=0.15)
+    biases = [np.mean(heights(0.3, seed, 4.0)) for seed in range(24)]
+    assert np.sqrt(np.mean(np.square(biases))) == pytest.approx(np.sqrt(0.3**2 - 0.75 * 0.1**2), rel=0.35)
+    assert SurveyConfig().horizontal_error_m == 0.1 and SurveyConfig().vertical_error_m == 0.3  # the paper's figures
 
 
 def test_density_follows_the_spacing(town: Town, survey: Survey) -> None:

@@ -132,7 +132,7 @@ def test_scans_in_a_surveyed_surface_leave_the_others_as_they_are() -> None:
 
 def test_a_surveyed_town_stands_where_the_town_stands() -> None:
     town = make_town(300_000, "suburb", 200.0)
-    surface = surveyed_world(town, 0.5)
+    surface = surveyed_world(town, PlacesConfig(survey_spacing_m=0.5))
     poses = surface.sample_poses(40, np.random.default_rng(0), border_m=30.0, clearance_m=1.5, tilt_deg=0.0)
     np.testing.assert_allclose(poses[:, 2, 3], town.terrain_height(poses[:, :2, 3]), atol=0.3)
     rng = np.random.default_rng(1)
