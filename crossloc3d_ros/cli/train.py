@@ -66,7 +66,16 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, required=True, help="file to write (.safetensors); the card lies beside it"
     )
     export.set_defaults(action=_export)
-    for command in (places, run, export):
+
+    card = commands.add_parser("card", help="write the card of exported weights anew, with benchmarks' results in it")
+    card.add_argument("run", type=Path, help="folder of the run that the weights are from")
+    card.add_argument("--weights", type=Path, required=True, help="exported weights; the card lies beside them")
+    card.add_argument("--places", type=Path, action="append", default=[], help="where its places are, if moved")
+    card.add_argument(
+        "--results", type=Path, nargs="+", default=[], metavar="JSON", help="results.json of evaluate, of these weights"
+    )
+    card.set_defaults(action=_card)
+    for command in (places, run, export, card):
         common.add_verbosity(command)
     return parser
 
@@ -121,6 +130,15 @@ def _export(arguments: argparse.Namespace) -> int:
 
     card = export_run(arguments.run, arguments.output, arguments.places)
     print(f"{arguments.output}\n{card}")
+    return 0
+
+
+def _card(arguments: argparse.Namespace) -> int:
+    from crossloc3d_ros.training.loop import write_card
+    from crossloc3d_ros.training.material import read_material
+
+    material = read_material(arguments.places) if arguments.places else None
+    print(write_card(arguments.run, arguments.weights, material, arguments.results))
     return 0
 
 

@@ -21,11 +21,11 @@ from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.gradients import batch_loss, tensors
 from crossloc3d_ros.training.initial import Initial, read_initial, take_over
 from crossloc3d_ros.training.loss import InfoNCE
-from crossloc3d_ros.training.material import read_material
+from crossloc3d_ros.training.material import Material, read_material
 from crossloc3d_ros.training.memory import keep_freed_memory
 from crossloc3d_ros.training.mining import mine
 from crossloc3d_ros.training.model_card import model_card
-from crossloc3d_ros.training.sampling import BatchSampler, HardPlaces
+from crossloc3d_ros.training.sampling import HardPlaces, Sampler
 from crossloc3d_ros.training.schedule import Budget, learning_rate
 from crossloc3d_ros.training.shards import ValidationTown, write_text
 from crossloc3d_ros.training.state import RunState, average, grow_batches, new_state
@@ -63,6 +63,8 @@ class Trainer:
     budget: Budget
     initial: Path | None = None
     """Weights to begin with; a resumed run has its own."""
+    preset: str | None = None
+    """Kind of a dataset, where `places` is one and its files do not say it."""
     report: Callable[[Progress], None] = field(default=lambda progress: None)
     clock: Callable[[], float] = time.monotonic
 
@@ -76,11 +78,11 @@ class Trainer:
         config = self.config
         torch.set_num_threads(config.threads)
         keep_freed_memory()
-        material = read_material(self.places, config.preprocessing)
+        material = read_material(self.places, config.preprocessing, self.preset)
         initial = None if self.initial is None else read_initial(self.initial, config.model)
         initial = run_folder.prepare(self.folder, config, material, initial, resume=resume)
-        sampler = BatchSampler(material.training_towns(), config)
-        held_out = material.validation_towns()
+        sampler = material.sampler(config)
+        held_out = material.validation_towns(config)
         log, state = self._begin(initial, resume=resume)
         self._learn(state, sampler, held_out, log)
         state.averaged = with_fresh_norms(state.averaged, sampler, config)
@@ -90,10 +92,15 @@ class Trainer:
         run_folder.export(self.folder / run_folder.FINAL, state.averaged, config, metadata)
         return validation
 
+    def check(self) -> None:
+        """Raise TrainingError where the folder holds no run, or one with other settings, places or beginning."""
+        material = read_material(self.places, self.config.preprocessing, self.preset)
+        run_folder.check(self.folder, self.config, material)
+
     def write_card(self) -> Path:
         """Write the model card of the run into its folder and return its path."""
         path = self.folder / run_folder.MODEL_CARD
-        write_text(path, model_card(self.folder, read_material(self.places)))
+        write_text(path, model_card(self.folder, read_material(self.places, preset=self.preset)))
         return path
 
     def _begin(self, initial: Initial | None, *, resume: bool) -> tuple[run_folder.Log, RunState]:
@@ -115,7 +122,7 @@ class Trainer:
         return log, state
 
     def _learn(
-        self, state: RunState, sampler: BatchSampler, held_out: Sequence[ValidationTown], log: run_folder.Log
+        self, state: RunState, sampler: Sampler, held_out: Sequence[ValidationTown], log: run_folder.Log
     ) -> None:
         config = self.config
         started = self.clock() - state.elapsed_s
@@ -168,7 +175,7 @@ class Trainer:
                 last_saved = state.elapsed_s
                 run_folder.save_state(self.folder, state.to_dict())
 
-    def _mine(self, state: RunState, sampler: BatchSampler, log: run_folder.Log) -> HardPlaces:
+    def _mine(self, state: RunState, sampler: Sampler, log: run_folder.Log) -> HardPlaces:
         began = time.monotonic()
         model = with_fresh_norms(state.averaged, sampler, self.config)
         hard = mine(sampler, lambda clouds: encode(model, clouds, self.config.device), self.config, state.step)
@@ -201,7 +208,7 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
     config = run_folder.read_config(folder)
     torch.set_num_threads(config.threads)
     settings = run_folder.read_settings(folder)
-    material = read_material(places or [Path(name) for name in settings.places])
+    material = read_material(places or [Path(name) for name in settings.places], preset=settings.preset)
     if material.sha256() != settings.places_sha256:
         raise TrainingError(f"the run in {folder} learned from other places than those named")
     saved = run_folder.load_state(folder)
@@ -209,19 +216,30 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
         raise TrainingError(f"the run in {folder} has not saved a state yet")
     state = new_state(config)
     state.load_dict(saved)
-    model = with_fresh_norms(state.averaged, BatchSampler(material.training_towns(), config), config)
-    held_out = material.validation_towns()
+    model = with_fresh_norms(state.averaged, material.sampler(config), config)
+    held_out = material.validation_towns(config)
     validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.turns)
     output.parent.mkdir(parents=True, exist_ok=True)
     notes = run_folder.metadata(config, state.step, state.elapsed_s, validation, run_folder.history(folder))
     run_folder.export(output, model, config, notes)
-    result = {"kind": "validation", "step": state.step, "elapsed_s": state.elapsed_s, **asdict(validation)}
-    card = output.parent / run_folder.MODEL_CARD
-    write_text(card, model_card(folder, material, result))
+    return write_card(folder, output, material)
+
+
+def write_card(folder: Path, weights: Path, material: Material | None = None, results: Sequence[Path] = ()) -> Path:
+    """Write the card of weights that were exported from the run in `folder` beside them, and return its path.
+
+    `material`: what the run learned from, by default where it lay then; `results`: JSON files of `evaluate`, of these
+    weights.
+    """
+    if material is None:
+        settings = run_folder.read_settings(folder)
+        material = read_material([Path(name) for name in settings.places], preset=settings.preset)
+    card = weights.parent / run_folder.MODEL_CARD
+    write_text(card, model_card(folder, material, weights=weights, results=results))
     return card
 
 
-def take_step(state: RunState, sampler: BatchSampler, rate: float, config: TrainConfig) -> float:
+def take_step(state: RunState, sampler: Sampler, rate: float, config: TrainConfig) -> float:
     """Learn from one batch and return its loss; weights stay as they are where it is not finite."""
     batch = sampler.batch(state.step, pairs=state.pairs, hard=state.hard)
     for group in state.optimizer.param_groups:
@@ -240,7 +258,7 @@ def take_step(state: RunState, sampler: BatchSampler, rate: float, config: Train
 
 
 @torch.no_grad()
-def with_fresh_norms(model: Network, sampler: BatchSampler, config: TrainConfig) -> Network:
+def with_fresh_norms(model: Network, sampler: Sampler, config: TrainConfig) -> Network:
     """Return a copy whose batch norms hold the statistics of its own weights, not an average of older ones'."""
     fresh = copy.deepcopy(model).train()
     norms = [module for module in fresh.modules() if isinstance(module, nn.modules.batchnorm._BatchNorm)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.training.sampling import BatchSampler, HardPlaces
+from crossloc3d_ros.training.sampling import HardPlaces, Sampler
 from crossloc3d_ros.training.validation import RADII_M, euclidean_distances
 from crossloc3d_ros.types import Float32Array
 
@@ -18,7 +18,7 @@ _ROWS = 1024
 
 
 def mine(
-    sampler: BatchSampler, encode: Callable[[list[Float32Array]], Float32Array], config: TrainConfig, step: int
+    sampler: Sampler, encode: Callable[[list[Float32Array]], Float32Array], config: TrainConfig, step: int
 ) -> HardPlaces:
     """Compare the submaps around places of all towns and return what looks most alike elsewhere.
 

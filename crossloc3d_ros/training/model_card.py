@@ -1,69 +1,174 @@
-"""The model card, written from the run's own files: nothing in it is typed by hand."""
+"""The model card, written from the run's own files and the benchmarks' results: nothing in it is typed by hand."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from crossloc3d_ros.config import to_dict
+from crossloc3d_ros.config import TrainConfig, to_dict
+from crossloc3d_ros.encoder.checkpoint import load_checkpoint
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
-from crossloc3d_ros.training.material import Material
+from crossloc3d_ros.training.material import Dataset, Material, Towns
 from crossloc3d_ros.training.shards import TRAINING, VALIDATION, Manifest, TownEntry
 from crossloc3d_ros.training.validation import QUANTILES
 
+_NAMES = {
+    "crossloc3d": "CrossLoc3D (ICCV 2023)",
+    "pointnetvlad": "PointNetVLAD (CVPR 2018)",
+    "lpdnet": "LPD-Net (ICCV 2019)",
+    "minkloc3d": "MinkLoc3D (WACV 2021)",
+    "minkloc3dv2": "MinkLoc3Dv2 (ICPR 2022)",
+    "minkloc3d_s": "MinkLoc3D-S (2021)",
+    "transloc3d": "TransLoc3D (2021)",
+}
+_MEASURES = (("R@1", 100.0), ("R@1", 50.0), ("R@1", 25.0), ("R@25", 100.0), ("R@1%", 100.0))
 
-def model_card(folder: Path, material: Material, result: dict[str, Any] | None = None) -> str:
-    """Return the card of the run in `folder` over the places of `material`, as Markdown.
 
-    `result` is a validation in the form of the log's; without it the run's last one is taken. Raises TrainingError
-    where there is none.
+def model_card(
+    folder: Path,
+    material: Material,
+    *,
+    weights: Path | None = None,
+    results: Sequence[Path] = (),
+) -> str:
+    """Return the card of the run in `folder`, which learned from `material`, as Markdown.
+
+    `weights`: the file that the card is of, exported from the run; by default what the run wrote last. `results`: JSON
+    files of `evaluate`, of just these weights. Raises TrainingError where the run has not validated yet, and for
+    results that cannot be read or are those of other weights.
     """
-    settings = to_dict(run_folder.read_config(folder))
+    config = run_folder.read_config(folder)
     entries = run_folder.read_log(folder)
-    validations = [entry for entry in entries if entry["kind"] == "validation"]
-    steps = [entry for entry in entries if entry["kind"] == "step"]
-    starts = [entry for entry in entries if entry["kind"] == "start"]
-    if result is not None:
-        validations = [v for v in validations if v["step"] < result["step"]] + [result]
+    validations = _of_kind(entries, "validation")
+    starts = _of_kind(entries, "start")
+    shown = weights or folder / run_folder.FINAL
+    benchmarks: list[dict[str, Any]] = []
+    if weights is not None or results:
+        checkpoint = load_checkpoint(shown)
+        if "examined" in checkpoint.metadata:
+            examined = json.loads(checkpoint.metadata["examined"])
+            validations = [v for v in validations if v["step"] < examined["step"]] + [examined]
+        benchmarks = _read_results(results, checkpoint.fingerprint)
     if not validations or not starts:
         raise TrainingError(f"the run in {folder} has not validated yet: there are no results to write a card from")
     last = validations[-1]
+    history = run_folder.history(folder)
+    name = weights.stem if weights is not None else folder.name
     sections = [
-        "# Model card: CrossLoc3D, first weights\n",
-        "LiDAR place recognition: a VLP-16 scan against submaps of an airborne survey, heading unknown. The network is "
-        "that of CrossLoc3D (ICCV 2023); the weights were learned from scratch on simulated towns alone.\n",
+        f"# Model card: {name}\n",
+        _introduction(config, material, history),
+        *([_benchmarks(benchmarks)] if benchmarks else []),
         _results(last),
         _distances(last),
         _course(validations),
-        *(_data(manifest) for manifest in material.manifests),
-        _training(settings, steps, starts, last, len(starts) - 1),
-        _LIMITS,
+        *_data(material),
+        *([_history(history)] if history else []),
+        _training(config, entries, last),
+        _limits(material),
     ]
     return "\n".join(sections)
 
 
+def _introduction(config: TrainConfig, material: Material, history: Sequence[dict[str, Any]]) -> str:
+    data = "simulated towns" if isinstance(material, Towns) else f"the dataset described below ({material.preset})"
+    if isinstance(material, Towns) and any("surveys" in m.settings for m in material.manifests):
+        data = "simulated towns and surveyed surfaces"
+    begun = "from scratch" if not history else f"from `{history[-1]['weights']}` on (see “What came before”)"
+    if config.headings > 1:
+        query = (
+            f"The heading of a query matters: it is encoded in {config.headings} headings, and the nearest descriptor "
+            "counts, which tells the heading besides."
+        )
+    elif config.turns > 1:
+        query = f"A query's descriptor is the mean over {config.turns} turns of it; its heading does not matter."
+    else:
+        query = "The heading of a query does not matter."
+    return (
+        "LiDAR place recognition: a scan against submaps of an airborne survey, heading unknown. The network is "
+        f"{_NAMES[config.model.network]}, with the settings below; the weights were learned {begun}, on {data}. "
+        f"{query}\n"
+    )
+
+
+def _read_results(paths: Sequence[Path], fingerprint: str) -> list[dict[str, Any]]:
+    """Return what `evaluate` wrote; TrainingError where it is damaged or of other weights than the card."""
+    found: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            content = json.loads(path.read_text())
+            encoders = {scores["about"]["encoder"] for scores in content}
+            for scores in content:
+                scores["all"] = {
+                    (f["measure"], float(f["radius_m"])): f for f in scores["figures"] if f["divided_by"] == "all"
+                }
+            missing = [m for scores in content for m in _MEASURES if m not in scores["all"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise TrainingError(f"{path} cannot be read as results of `evaluate` ({error})") from error
+        if missing or not content:
+            raise TrainingError(f"{path} holds no results of `evaluate`, or not all of them")
+        if encoders != {fingerprint}:
+            raise TrainingError(
+                f"{path} holds results of the weights {', '.join(sorted(encoders))}, the card is of {fingerprint}"
+            )
+        found += content
+    return found
+
+
+def _benchmarks(results: Sequence[dict[str, Any]]) -> str:
+    lines = [
+        "## Benchmarks\n",
+        "Written by `evaluate`. In brackets the 95 % interval of a bootstrap over whole towns, or over squares of 50 m "
+        "where there are fewer than eight towns; “by lot” is R@1 at 100 m of a random order. Nothing was trained or "
+        "tuned on them.\n",
+        "| benchmark | database | heading of the query | queries | "
+        + " | ".join(f"{label} {radius:.0f} m" for label, radius in _MEASURES)
+        + " | by lot |",
+        "|---" * (5 + len(_MEASURES)) + "|",
+    ]
+    for scores in results:
+        about, figures = scores["about"], scores["all"]
+        tried = about["query_headings"]
+        how = {"nearest": "nearest kept", "mean": "mean descriptor"}[about["way"]]
+        heading = "north-aligned" if about["heading"] == "aligned" else "random"
+        heading += f", {tried} tried, {how}" if tried > 1 else ""
+        cells = [_percent(figures[measure]) for measure in _MEASURES]
+        lot = f"{100 * figures['R@1', 100.0]['chance']:.1f} %"
+        lines.append(
+            f"| {about['benchmark']} | {about['setting']}, {about['database']:,} | {heading} | "
+            f"{figures['R@1', 100.0]['queries']:,} | {' | '.join(cells)} | {lot} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _percent(figure: dict[str, Any]) -> str:
+    value = figure["recall"] if "recall" in figure else figure["value"]
+    if value is None:
+        return "none to count"
+    return f"{100 * value:.1f} % [{100 * figure['low']:.1f}, {100 * figure['high']:.1f}]"
+
+
 def _results(entry: dict[str, Any]) -> str:
     lines = [
-        "## Results\n",
-        f"{entry['queries']:,} scans of towns that training never saw, headings over the full circle, against one "
-        f"database of {entry['submaps']:,} aerial submaps of those towns (no ground submaps). Surveys and scans are of "
-        "different epochs. In brackets the 95 % Wilson interval over the queries; queries of one town resemble each "
-        "other, so the true interval is wider. These towns served to pick `best.safetensors` and nothing else.\n",
+        "## Validation\n",
+        f"{entry['queries']:,} scans of places that training never saw, against one database of "
+        f"{entry['submaps']:,} submaps of those places. In brackets the 95 % Wilson interval over the queries; queries "
+        "of one town resemble each other, so the true interval is wider. These places served to pick "
+        "`best.safetensors`, and to fit the calibration that travels with the weights.\n",
         "| within | measure | recall | chance |",
         "|---|---|---|---|",
     ]
     for r in entry["recalls"]:
         measure = f"{r['label']} ({r['count']})" if r["label"] == "R@1%" else r["label"]
-        interval = f"{100 * r['value']:.1f} % [{100 * r['low']:.1f}, {100 * r['high']:.1f}]"
-        lines.append(f"| {r['radius_m']:.0f} m | {measure} | {interval} | {100 * r['chance']:.1f} % |")
+        lines.append(f"| {r['radius_m']:.0f} m | {measure} | {_percent(r)} | {100 * r['chance']:.1f} % |")
     return "\n".join(lines) + "\n"
 
 
 def _distances(entry: dict[str, Any]) -> str:
     lines = [
-        "## Descriptor distances on the same towns\n",
+        "## Descriptor distances on the same places\n",
         "Euclidean, to the submap whose centre is nearest to the scan, and to the nearest descriptor among the submaps "
         "more than 100 m away. The same numbers travel in the weights' metadata (`distances`).\n",
         "| quantile | " + " | ".join(f"{100 * q:.0f} %" for q in QUANTILES) + " |",
@@ -89,23 +194,36 @@ def _course(validations: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _data(manifest: Manifest) -> str:
-    settings = manifest.settings
-    lines = [
-        "## Data\n",
-        "Simulated, by this package, from seeds; no real data. "
-        f"`train make-places --towns {settings['towns']} --validation-towns {settings['validation_towns']} "
-        f"--seed {settings['seed']}` makes the same places again.\n",
-        "| | towns | families | scans | submaps |",
-        "|---|---|---|---|---|",
-    ]
+def _data(material: Material) -> Iterator[str]:
+    yield "## Data\n"
+    if isinstance(material, Dataset):
+        digest = material.sha256()
+        yield f"A dataset in the layout of CS-Campus3D, preset `{material.preset}`, fingerprint `{digest}`.\n"
+    elif isinstance(material, Towns):
+        yield from map(_towns, material.manifests)
+
+
+def _towns(manifest: Manifest) -> str:
+    settings = dict(manifest.settings)
+    if {"towns", "validation_towns", "seed"} <= settings.keys():
+        made = (
+            "Simulated, by this package, from seeds; no real data. "
+            f"`train make-places --towns {settings['towns']} --validation-towns {settings['validation_towns']} "
+            f"--seed {settings['seed']}` with the settings below makes the same places again.\n"
+        )
+    else:
+        made = (
+            "A simulated sensor in the surface of a real survey: `train make-places --survey FILES` with the files, "
+            "the seed and the settings below.\n"
+        )
+    lines = [made, "| | towns | families | scans | submaps |", "|---|---|---|---|---|"]
     for role, submaps in ((TRAINING, "cut anywhere, at any heading"), (VALIDATION, "")):
         towns = manifest.of_role(role)
-        cut = submaps or f"{sum(t.submaps for t in towns):,}"
-        lines.append(f"| {role} | {len(towns)} | {_families(towns)} | {sum(t.scans for t in towns):,} | {cut} |")
-    lines.append(
-        f"\nSettings: `{json.dumps(settings['places'])}`, preprocessing `{json.dumps(settings['preprocessing'])}`"
-    )
+        if towns:
+            cut = submaps or f"{sum(t.submaps for t in towns):,}"
+            lines.append(f"| {role} | {len(towns)} | {_families(towns)} | {sum(t.scans for t in towns):,} | {cut} |")
+    rest = {key: value for key, value in settings.items() if key not in ("towns", "validation_towns")}
+    lines.append(f"\nSettings: `{json.dumps(rest)}`")
     return "\n".join(lines) + "\n"
 
 
@@ -116,42 +234,88 @@ def _families(towns: list[TownEntry]) -> str:
     return ", ".join(f"{family} {count}" for family, count in sorted(counts.items()))
 
 
-def _training(
-    settings: dict[str, Any],
-    steps: list[dict[str, Any]],
-    starts: list[dict[str, Any]],
-    last: dict[str, Any],
-    resumed: int,
-) -> str:
-    first = starts[0]
-    samples = 2 * settings["pairs"] * last["step"]
+def _history(history: Sequence[dict[str, Any]]) -> str:
+    lines = [
+        "## What came before\n",
+        "The run began with the last of these weights, as far as their tensors fit; each began with the one above.\n",
+        "| weights | fingerprint | steps | hours | loss | seed |",
+        "|---|---|---|---|---|---|",
+    ]
+    for entry in history:
+        training = entry.get("training", {})
+        values = [str(training.get(key, "unknown")) for key in ("steps", "hours", "loss", "seed")]
+        lines.append(f"| {entry['weights']} | `{entry['fingerprint']}` | {' | '.join(values)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _training(config: TrainConfig, entries: list[dict[str, Any]], last: dict[str, Any]) -> str:
+    starts = _of_kind(entries, "start")
+    steps = [entry for entry in _of_kind(entries, "step") if entry["step"] <= last["step"]]
+    first, resumed = starts[0], len(starts) - 1
+    samples = steps[-1].get("clouds", 2 * config.pairs * last["step"]) if steps else 2 * config.pairs * last["step"]
     loss = f"{steps[-1]['loss']:.3f}" if steps else "unknown"
-    hardware = (
-        f"{first['processor']}, {first['threads']} of {first['cores']} cores, accelerator: {first['accelerator']}"
+    initial = [entry["weights"] for entry in _of_kind(entries, "initial")][:1]
+    begun = f" --initial {Path(initial[0]).name}" if initial else ""
+    machines = dict.fromkeys(
+        f"{start['processor']}, {start['threads']} of {start['cores']} cores, accelerator: {start['accelerator']}"
+        for start in starts
     )
+    budget = starts[-1].get("budget", "")
+    settings = to_dict(config)
     recipe = {key: value for key, value in settings.items() if key not in ("model", "preprocessing", "device")}
-    budget = first.get("budget", "")
     return f"""## Training
 
-* Command: `train run --places PLACES --output RUN {budget} --config SETTINGS`, the settings being those below; \
-seed {settings["seed"]}; interrupted and resumed {resumed} times.
-* {last["step"]:,} steps, {samples:,} clouds, {last["elapsed_s"] / 3600:.2f} hours on the clock, validation included, \
-beside other work on the same machine; training loss at the end {loss}.
-* Machine: {hardware}. Python {first["python"]}, torch {first["torch"]}, numpy {first["numpy"]}.
+* Command: `train run --places PLACES --output RUN{begun} {budget} --config SETTINGS`, the settings being those below; \
+seed {config.seed}; stopped and resumed {resumed} times.
+* {last["step"]:,} steps, about {samples:,} clouds, {last["elapsed_s"] / 3600:.2f} hours on the clock, validation \
+included; training loss at the end {loss}.
+* Machine: {"; then ".join(machines)}. Python {first["python"]}, torch {first["torch"]}, numpy {first["numpy"]}.
 * Network: `{json.dumps(settings["model"])}`
+* Preprocessing: `{json.dumps(settings["preprocessing"])}`
 * Recipe: `{json.dumps(recipe)}`
-* AdamW, warm-up and cosine over the budget, clipped gradients, averaged weights with batch-norm statistics of their \
-own; both sides of a pair are turned over the full circle and mirrored together, scans are thinned and partly blocked; \
-the loss is on the Euclidean distance that the map is searched by.
+* {_recipe(config)}
 """
 
 
-_LIMITS = """## What it cannot do
+def _recipe(config: TrainConfig) -> str:
+    """Say the recipe in words."""
+    losses = {
+        "info_nce": "cross entropy of each pair against the whole batch, both ways",
+        "smooth_ap": "truncated smooth average precision over the whole batch, both ways",
+        "batch_hard": "batch-hard triplets with swap",
+    }
+    rate = "a warm-up, a constant part and a cosine" if not config.milestones else "a tenth at each milestone"
+    parts = [f"AdamW, learning rate with {rate}", f"loss: {losses[config.loss]}, on the Euclidean distance"]
+    if config.chunk_pairs:
+        parts.append(f"multistage back-propagation in chunks of {config.chunk_pairs} pairs, batch norms by chunk")
+    if config.hard_share > 0.0:
+        parts.append("part of each batch from places of all towns that the weights confused")
+    if config.augmentation == "paper":
+        parts.append("the published augmentation")
+    elif config.headings == 1:
+        parts.append(
+            "both sides of a pair turned over the full circle and mirrored together, scans thinned and partly blocked"
+        )
+    else:
+        parts.append("pairs turned and mirrored together, near each other in heading, scans thinned and partly blocked")
+    if config.ema_decay > 0.0:
+        parts.append("averaged weights with batch-norm statistics of their own")
+    return "; ".join(parts) + "."
 
-* It has seen simulated towns only: real buildings, trees and sensors differ, and the figures above do not carry over \
-to them. Judge it on a drive through a real survey before relying on it.
-* It tells places apart by what stands above the ground within 50 m. Open fields, water, forests without structure, \
-tunnels and interiors give it nothing to go by.
-* It knows one sensor (16 beams, -15 to +15 degrees) near 0.9 to 1.6 m above the ground, upright within a few degrees.
-* A descriptor gives a place, not a heading, and not a metre: the nearest submap's centre is the answer.
+
+def _limits(material: Material) -> str:
+    seen = "simulated towns only: real buildings, trees and sensors differ, and figures on them do not carry over"
+    if isinstance(material, Dataset):
+        seen = "the places of one dataset: other towns, seasons and sensors differ, and figures do not carry over"
+    return f"""## What it cannot do
+
+* It has seen {seen}. Judge it on a drive through a survey of your own before relying on it.
+* It tells places apart by what stands above the ground within reach of a patch. Open fields, water, forests without \
+structure, tunnels and interiors give it nothing to go by.
+* It knows the sensors that its data were taken with, upright within a few degrees.
+* A descriptor gives a place, not a metre: the nearest submap's centre is the answer.
 """
+
+
+def _of_kind(entries: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    return [entry for entry in entries if entry["kind"] == kind]

@@ -43,6 +43,8 @@ class Settings:
     config: dict[str, Any]
     places: tuple[str, ...]
     places_sha256: str
+    preset: str | None
+    """Kind of the dataset; None for places."""
     initial: dict[str, Any] | None
     """Weights that it began with: `path`, `fingerprint`, and `history`, the chain up to and with them."""
 
@@ -63,7 +65,9 @@ def prepare(
             "history": initial.history,
         }
     if not resume:
-        settings = Settings(to_dict(config), tuple(map(str, material.folders)), material.sha256(), noted)
+        settings = Settings(
+            to_dict(config), tuple(map(str, material.folders)), material.sha256(), material.preset, noted
+        )
         if path.exists():
             raise TrainingError(f"{folder} holds a run already: go on with it by `--resume`, or name another folder")
         try:
@@ -72,15 +76,7 @@ def prepare(
             raise TrainingError(f"cannot make {folder}: {error.strerror or error}") from error
         write_text(path, json.dumps(asdict(settings), indent=1) + "\n")
         return initial
-    before = read_settings(folder)
-    if before.places_sha256 != material.sha256():
-        raise TrainingError(f"the run in {folder} learned from other places than those named")
-    old = to_dict(read_config(folder))  # a setting that did not exist yet has its default
-    for key, value in to_dict(config).items():
-        if key not in _FREE_TO_CHANGE and old[key] != value:
-            raise TrainingError(
-                f"the run in {folder} has '{key}' {old[key]}, not {value}: a resumed run keeps its settings"
-            )
+    before = check(folder, config, material)
     for leftover in folder.glob(".*.partial"):
         leftover.unlink(missing_ok=True)
     if noted is not None and (before.initial or {}).get("fingerprint") != noted["fingerprint"]:
@@ -90,6 +86,20 @@ def prepare(
         if initial.checkpoint.fingerprint != before.initial["fingerprint"]:
             raise TrainingError(f"{initial.path} no longer holds the weights that the run in {folder} began with")
     return initial
+
+
+def check(folder: Path, config: TrainConfig, material: Material) -> Settings:
+    """Return the settings of the run in a folder; raises TrainingError where they or its material are others."""
+    before = read_settings(folder)
+    if before.places_sha256 != material.sha256():
+        raise TrainingError(f"the run in {folder} learned from other places than those named")
+    old = to_dict(read_config(folder))  # a setting that did not exist yet has its default
+    for key, value in to_dict(config).items():
+        if key not in _FREE_TO_CHANGE and old[key] != value:
+            raise TrainingError(
+                f"the run in {folder} has '{key}' {old[key]}, not {value}: a resumed run keeps its settings"
+            )
+    return before
 
 
 def read_settings(folder: Path) -> Settings:
@@ -102,6 +112,7 @@ def read_settings(folder: Path) -> Settings:
             content["config"],
             (places,) if isinstance(places, str) else tuple(places),  # a run of one folder, as once written
             content["places_sha256"],
+            content.get("preset"),
             content.get("initial"),
         )
     except FileNotFoundError as error:
@@ -203,9 +214,9 @@ def metadata(
 ) -> dict[str, str]:
     """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
 
-    `headings` and `turns` say how a query is encoded, `history` which weights the run began with (`chain`).
-    `distances` holds the quantiles of the descriptor distance to the right submap and to the nearest wrong one on the
-    held-out towns, `credibility` what the localizer makes of distances.
+    `examined` is the whole validation; `headings` and `turns` say how a query is encoded, `history` which weights the
+    run began with (`chain`). `distances` holds the quantiles of the descriptor distance to the right submap and to the
+    nearest wrong one on the held-out towns, `credibility` what the localizer makes of distances.
     """
     distances = {
         "quantiles": QUANTILES,
@@ -221,6 +232,7 @@ def metadata(
         "distances": json.dumps(distances),
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
+        "examined": json.dumps({"kind": "validation", "step": step, "elapsed_s": elapsed_s, **asdict(validation)}),
         "headings": str(config.headings),
         "turns": str(config.turns),
         HISTORY: json.dumps(chain),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
@@ -49,6 +49,27 @@ class HardPlaces:
     """(N,) index of the scan in it, which is where the place is."""
     neighbours: Int64Array
     """(N, K) rows of the places with the nearest descriptors, all of them elsewhere."""
+
+
+class Sampler(Protocol):
+    """What draws batches, of whatever material."""
+
+    @property
+    def places(self) -> tuple[Int64Array, Int64Array, Float64Array]:
+        """Return town (N,), scan (N,) and position (N, 2) in metres, town frame, of all places to learn from."""
+        ...
+
+    def submap(self, town: int, scan: int) -> Float32Array | None:
+        """Return the patch (n, 3) of the submap around the place of a scan, or None where there is too little."""
+        ...
+
+    def batch(self, step: int, *, pairs: int = 0, hard: HardPlaces | None = None) -> Batch:
+        """Return the batch of a step, the same at every call with the same arguments.
+
+        `pairs`: how many, by default as configured. With `hard` the share `hard_share` of them comes from groups of
+        places that were taken for each other.
+        """
+        ...
 
 
 class _Wish(NamedTuple):
@@ -102,25 +123,21 @@ class BatchSampler:
 
     @property
     def places(self) -> tuple[Int64Array, Int64Array, Float64Array]:
-        """Return town (N,), scan (N,) and position (N, 2), town frame, of all places to learn from."""
+        """See `Sampler.places`."""
         counts = [len(town) for town in self._towns]
         towns = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
         scans = np.concatenate([np.arange(count, dtype=np.int64) for count in counts])
         return towns, scans, np.concatenate([town.scan_xy_m for town in self._towns])
 
     def submap(self, town: int, scan: int) -> Float32Array | None:
-        """Return the patch (n, 3) of the submap centred where a scan was taken, or None where there is too little."""
+        """See `Sampler.submap`; it is centred where the scan was taken."""
         preprocessing = self._config.preprocessing
         points = self._fields[town].cut(self._towns[town].scan_xy_m[scan], 0.0, preprocessing.half_extent_m)
         patch = make_patch(points, preprocessing.half_extent_m, preprocessing)
         return None if patch is None else patch.points
 
     def batch(self, step: int, *, pairs: int = 0, hard: HardPlaces | None = None) -> Batch:
-        """Return the batch of a step, the same at every call with the same arguments.
-
-        `pairs`: how many, by default as configured. With `hard` a share of them comes from groups of places that
-        were taken for each other.
-        """
+        """See `Sampler.batch`."""
         config = self._config
         rng = np.random.default_rng((config.seed, step))
         pairs = pairs or config.pairs

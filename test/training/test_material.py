@@ -32,11 +32,12 @@ def change(folder: Path, change: Callable[[dict[str, object]], object]) -> None:
 
 def test_a_run_learns_from_the_towns_of_all_folders(two: list[Path], tmp_path: Path, tiny: TrainConfig) -> None:
     material = read_material(two, tiny.preprocessing)
-    assert len(material.training_towns()) == 5 and len(material.validation_towns()) == 2
+    towns, _, _ = material.sampler(tiny).places
+    assert set(towns.tolist()) == set(range(5)) and len(material.validation_towns(tiny)) == 2
     alone = [read_material([folder]) for folder in two]
     trainer = Trainer(tiny, two, tmp_path / "run", Budget(steps=1))
     validation = trainer.run()
-    assert validation.submaps == sum(len(t.submap_xy_m) for m in alone for t in m.validation_towns())
+    assert validation.submaps == sum(len(t.submap_xy_m) for m in alone for t in m.validation_towns(tiny))
     card = trainer.write_card().read_text()
     assert card.count("make-places") == 2
     assert load_checkpoint(tmp_path / "run" / run_folder.FINAL).metadata["headings"] == "1"
@@ -71,4 +72,4 @@ def test_a_damaged_town_is_named(two: list[Path], tmp_path: Path, tiny: TrainCon
         Trainer(tiny, two, tmp_path / "run", Budget(steps=1)).run()
     path.unlink()
     with pytest.raises(TrainingError, match=r"train_51\.npz is missing"):
-        read_material(two).training_towns()
+        read_material(two).sampler(tiny)
