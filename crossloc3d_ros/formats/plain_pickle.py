@@ -272,7 +272,7 @@ class _Machine:
             kept = _settled(value)
             if self._shrink is not None:
                 kept = self._shrink(key, kept)
-                if isinstance(value, list):  # which the memo goes on holding
+                if isinstance(value, list) and kept is not value:  # the memo goes on holding it
                     value[:] = [_Kept(kept)]
             target[key] = kept
 

@@ -187,11 +187,11 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_values_may_be_made_smaller_as_they_are_read(tmp_path: Path) -> None:
-    content = {i: {"query": str(i), "negatives": list(range(5000))} for i in range(4)}
+    content = {i: {"query": str(i), "negatives": list(range(5000)), "mixed": [i, "a"], "none": []} for i in range(4)}
     found = read_plain_pickle(
         written(tmp_path, content), lambda key, value: len(value) if key == "negatives" else value
     )
-    assert found == {i: {"query": str(i), "negatives": 5000} for i in range(4)}
+    assert found == {i: {"query": str(i), "negatives": 5000, "mixed": [i, "a"], "none": []} for i in range(4)}
 
 
 def test_a_list_that_is_named_twice_is_read_twice(tmp_path: Path) -> None:
