@@ -23,7 +23,7 @@ from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array
 CHUNK_CLOUDS = 256
 """Clouds encoded between two writes."""
 BATCH = 32
-_TIMED_QUERIES = 25
+_TIMED_QUERIES = 15
 
 Progress = Callable[[str, float, float, str], None]
 

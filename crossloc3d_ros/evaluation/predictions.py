@@ -164,11 +164,11 @@ def predict_all(evaluation_set: EvaluationSet, job: EncodingJob, plan: Plan, wei
                 ways.append(("random", count, "mean", descriptors.mean(axis=1, keepdims=True)))
     predictions = []
     own = job.encoder if isinstance(job.encoder, OwnDistance) else None
+    timed: dict[int, tuple[float, float]] = {}
     for setting in plan.settings:
         database = np.concatenate(encoded if setting == "aerial+ground" else encoded[:1])[:, 0]
         top = min(len(database), max(STORED, one_per_cent(len(database))))
         index = DescriptorMap(database) if own is None else None
-        timed: dict[int, tuple[float, float]] = {}
         for mode, count, way, descriptors in ways:
             if count not in timed:
                 timed[count] = time_queries(job.encoder, queries, count, database, top)
