@@ -75,7 +75,12 @@ def _parser() -> argparse.ArgumentParser:
         "--results", type=Path, nargs="+", default=[], metavar="JSON", help="results.json of evaluate, of these weights"
     )
     card.set_defaults(action=_card)
-    for command in (places, run, export, card):
+
+    curve = commands.add_parser("curve", help="draw loss, validation and rate of a run as an HTML page")
+    curve.add_argument("run", type=Path, help="folder of the run")
+    curve.add_argument("--output", type=Path, help="file to write (default: progress.html in the run)")
+    curve.set_defaults(action=_curve)
+    for command in (places, run, export, card, curve):
         common.add_verbosity(command)
     return parser
 
@@ -139,6 +144,13 @@ def _card(arguments: argparse.Namespace) -> int:
 
     material = read_material(arguments.places) if arguments.places else None
     print(write_card(arguments.run, arguments.weights, material, arguments.results))
+    return 0
+
+
+def _curve(arguments: argparse.Namespace) -> int:
+    from crossloc3d_ros.training.curve import write_curve
+
+    print(f"{write_curve(arguments.run, arguments.output)}   (open it in a browser)")
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import logging
 import math
 import time
@@ -18,6 +19,7 @@ from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.curve import write_curve
 from crossloc3d_ros.training.gradients import batch_loss, tensors
 from crossloc3d_ros.training.initial import Initial, read_initial, take_over
 from crossloc3d_ros.training.loss import InfoNCE
@@ -76,6 +78,8 @@ class Trainer:
         may be another one.
         """
         config = self.config
+        if config.device == "cuda" and not torch.cuda.is_available():
+            raise TrainingError("device 'cuda': this machine's torch sees no GPU; use cpu")
         torch.set_num_threads(config.threads)
         keep_freed_memory()
         material = read_material(self.places, config.preprocessing, self.preset)
@@ -90,6 +94,7 @@ class Trainer:
         run_folder.save_state(self.folder, state.to_dict())
         metadata = self._metadata(state, validation)
         run_folder.export(self.folder / run_folder.FINAL, state.averaged, config, metadata)
+        self._draw(live=False)
         return validation
 
     def check(self) -> None:
@@ -169,11 +174,17 @@ class Trainer:
                     state.best_recall = recall
                     run_folder.export(self.folder / run_folder.BEST, averaged, config, metadata)
                 self.report(Progress(state.step, share, loss, rate, 0.0, 0.0, validation))
+                self._draw(live=True)
                 state.elapsed_s = self.clock() - started
                 last_logged, logged_clouds = state.elapsed_s, state.clouds
             if state.elapsed_s - last_saved >= 60.0 * config.save_minutes:
                 last_saved = state.elapsed_s
                 run_folder.save_state(self.folder, state.to_dict())
+
+    def _draw(self, *, live: bool) -> None:
+        """Write the page on how the run goes, once there is something to draw."""
+        if any(entry["kind"] == "step" for entry in run_folder.read_log(self.folder)):
+            write_curve(self.folder, live=live)
 
     def _mine(self, state: RunState, sampler: Sampler, log: run_folder.Log) -> HardPlaces:
         began = time.monotonic()
@@ -206,6 +217,8 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
     the calibration in the weights are those of just these weights. `places`: where the run's places are now.
     """
     config = run_folder.read_config(folder)
+    if not torch.cuda.is_available():
+        config = dataclasses.replace(config, device="cpu", precision="float32")
     torch.set_num_threads(config.threads)
     settings = run_folder.read_settings(folder)
     material = read_material(places or [Path(name) for name in settings.places], preset=settings.preset)

@@ -31,6 +31,7 @@ LOG = "log.jsonl"
 BEST = "best.safetensors"
 FINAL = "final.safetensors"
 MODEL_CARD = "MODEL_CARD.md"
+CURVE = "progress.html"
 
 _FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "log_steps", "turns"}
 """Settings that a resumed run may change: they do not touch the weights."""
