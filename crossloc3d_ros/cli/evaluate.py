@@ -18,7 +18,7 @@ from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, r
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.cli.replay import own_version
 from crossloc3d_ros.encoder.checkpoint import load_encoder
-from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
 from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, write_page
 from crossloc3d_ros.evaluation.encoding import EncodingJob
@@ -36,8 +36,10 @@ from crossloc3d_ros.evaluation.predictions import (
 )
 from crossloc3d_ros.evaluation.published import load_evaluation_set
 from crossloc3d_ros.evaluation.results import as_csv, as_json, headline
+from crossloc3d_ros.evaluation.scan_context import ScanContext
 from crossloc3d_ros.evaluation.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
 from crossloc3d_ros.evaluation.sets import EvaluationSet
+from crossloc3d_ros.places.workers import EncoderLoader
 from crossloc3d_ros.types import DescriptorEncoder
 
 PAGE, CSV, JSON, PREDICTIONS = "index.html", "results.csv", "results.json", "predictions"
@@ -57,6 +59,10 @@ def _parser() -> argparse.ArgumentParser:
         "A run that was stopped goes on where it was.",
     )
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
+    parser.add_argument(
+        "--method", choices=["weights", "scan_context"], default="weights",
+        help="scan_context: polar height maps, without learning, in place of weights (default: %(default)s)",
+    )  # fmt: skip
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--benchmark", choices=list(BENCHMARKS), default="simulated", help="(default: %(default)s)")
     source.add_argument("--dataset", type=Path, help="folder in the layout of CS-Campus3D, as make_dataset writes it")
@@ -94,14 +100,15 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     target = console()
     set_up_logging(arguments.verbose, target)
     if arguments.workers < 1:
-        raise EvaluationError(f"--workers must be at least 1, got {arguments.workers}")
-    encoder = load_encoder(arguments.weights, arguments.device)
+        raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    loader = _loader(arguments)
+    encoder = loader()
     with ProgressDisplay(target) as display:
         evaluation_set = _open(arguments, encoder, display)
     output: Path = arguments.output or Path("out/evaluate") / evaluation_set.name.replace(" ", "_")
     if not arguments.only_score:
         with ProgressDisplay(target) as display:
-            _predict(arguments, encoder, evaluation_set, output, display)
+            _predict(arguments, loader, encoder, evaluation_set, output, display)
     predictions = _read_predictions(output / PREDICTIONS)
     scores = [score(each, evaluation_set) for each in predictions]
     main_scores = headline(scores, *way_of(encoder))
@@ -114,6 +121,16 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     for table in tables(scores, main_scores):
         results.print(table)
     print(f"{output / CSV}\n{output / JSON}\n{output / PAGE}   (open it in a browser)")
+
+
+def _loader(arguments: argparse.Namespace) -> EncoderLoader:
+    """Return what loads the method, in other processes too; there one thread each is best."""
+    if arguments.method == "scan_context":
+        if arguments.weights is not None:
+            raise ConfigError("--method scan_context has no weights: leave --weights out")
+        return ScanContext
+    threads = 1 if arguments.workers > 1 else None
+    return functools.partial(load_encoder, arguments.weights, arguments.device, threads)
 
 
 def _open(arguments: argparse.Namespace, encoder: DescriptorEncoder, display: ProgressDisplay) -> EvaluationSet:
@@ -132,6 +149,7 @@ def _open(arguments: argparse.Namespace, encoder: DescriptorEncoder, display: Pr
 
 def _predict(
     arguments: argparse.Namespace,
+    loader: EncoderLoader,
     encoder: DescriptorEncoder,
     evaluation_set: EvaluationSet,
     output: Path,
@@ -147,7 +165,7 @@ def _predict(
     )
     job = EncodingJob(
         encoder,
-        functools.partial(load_encoder, arguments.weights, arguments.device, threads=1),
+        loader,
         arguments.data / "descriptors",
         arguments.workers,
         display,
@@ -253,6 +271,8 @@ _AMSTERDAM_WORDS = (
 
 
 def _label(arguments: argparse.Namespace) -> str:
+    if arguments.method == "scan_context":
+        return "Scan Context"
     return "shipped weights" if arguments.weights is None else str(arguments.weights.stem)
 
 

@@ -241,9 +241,22 @@ def _words(main: Scores, texts: PageTexts) -> str:
         "2,000 times; where fewer than eight towns were asked, squares of 50 m stand in for them. The interval holds "
         "95 % of these draws and is widened to hold Wilson's interval for as many trials as there are places at least "
         "25 m apart.</p>",
+        *_heading_words(main),
         *(f"<p>{escape(sentence)}</p>" for sentence in texts.words),
     ]
     return "".join(paragraphs)
+
+
+def _heading_words(main: Scores) -> list[str]:
+    if main.heading is None:
+        return []
+    errors = main.heading
+    return [
+        f"<h3>The heading that comes with an answer</h3><p>Each query was tried every {errors.step_deg:g} degrees. Of "
+        f"the {errors.queries:,} first answers within 100 m, the heading in which the query lay nearest was off by "
+        f"{errors.median_deg:.0f} degrees in the median, and by at most one step in "
+        f"{percent(errors.within_step)}.</p>"
+    ]
 
 
 def percent(share: float) -> str:

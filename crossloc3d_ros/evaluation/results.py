@@ -54,6 +54,7 @@ def as_json(scores: Sequence[Scores]) -> str:
         {
             "about": dataclasses.asdict(each.about),
             "figures": list(_rows(each)),
+            "heading": None if each.heading is None else dataclasses.asdict(each.heading),
             "curves": [
                 {
                     "radius_m": curve.radius_m,

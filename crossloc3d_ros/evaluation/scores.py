@@ -20,9 +20,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from crossloc3d_ros.evaluation.predictions import About, Predictions, database_of, metres_of, one_per_cent
+from crossloc3d_ros.evaluation.predictions import (
+    About,
+    Predictions,
+    database_of,
+    driven_angles,
+    metres_of,
+    one_per_cent,
+)
 from crossloc3d_ros.evaluation.recall import Share, hits, independent_places, wilson_share
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet
+from crossloc3d_ros.localization.retrieval import heading_angles
 from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array
 
 RADII_M = (100.0, 50.0, 25.0)
@@ -80,6 +88,18 @@ class GroupScores:
         raise KeyError(f"no {label} within {radius_m} m")
 
 
+@dataclass(frozen=True)
+class HeadingErrors:
+    """How well the heading in which a query was found tells the robot's, over first answers within 100 m."""
+
+    queries: int
+    step_deg: float
+    """Between the headings tried."""
+    median_deg: float
+    within_step: float
+    """Share of the errors of at most one step."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Everything that predictions are worth."""
@@ -93,6 +113,8 @@ class Scores:
     curves: tuple[Curve, ...]
     first_m: Float64Array
     """(Q,) metres from each query to its first answer, infinite in another area."""
+    heading: HeadingErrors | None = None
+    """None where a query was not tried in several headings, or none was found."""
 
     def tables(self) -> Mapping[str, Sequence[GroupScores]]:
         """Return the groups of figures by what they are divided by."""
@@ -123,7 +145,21 @@ def score(predictions: Predictions, evaluation_set: EvaluationSet) -> Scores:
         areas=tuple(of(evaluation_set.area_names[area], queries.area == area) for area in areas),
         curves=tuple(_curve(truth, len(database)) for truth in truths),
         first_m=metres[:, 0],
+        heading=_heading_errors(predictions, queries, np.asarray(metres[:, 0] <= max(RADII_M), dtype=np.bool_)),
     )
+
+
+def _heading_errors(predictions: Predictions, queries: PlaceSet, found: BoolArray) -> HeadingErrors | None:
+    about = predictions.about
+    if about.heading != "random" or about.way != "nearest" or about.query_headings == 1:
+        return None
+    driven = found & (driven_angles(queries)[:, 0] == 0.0)  # of the others the heading is not known
+    if not driven.any():
+        return None
+    tried = heading_angles(about.query_headings)[predictions.headings[driven, 0]]
+    apart = np.degrees(np.abs(np.angle(np.exp(1j * (tried - queries.heading_rad[driven])))))
+    step_deg = 360.0 / about.query_headings
+    return HeadingErrors(int(driven.sum()), step_deg, float(np.median(apart)), float(np.mean(apart <= step_deg)))
 
 
 @dataclass(frozen=True, eq=False)

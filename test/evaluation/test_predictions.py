@@ -146,6 +146,11 @@ def test_a_query_of_unknown_heading_is_found_where_one_of_its_headings_fits(tmp_
     recall = {name: score(each, towns).overall.figure("R@1", 25.0).share.value for name, each in made.items()}
     assert recall["aerial_aligned"] == recall["aerial_random_8-nearest"] == 1.0
     assert recall["aerial_random"] < recall["aerial_random_2-nearest"] < 0.5
+    errors = score(made["aerial_random_8-nearest"], towns).heading
+    assert errors is not None
+    assert (errors.queries, errors.step_deg) == (len(towns.queries), 45.0)
+    assert errors.median_deg == pytest.approx(0.0, abs=1e-3)
+    assert score(made["aerial_random"], towns).heading is None
     # The number of the heading is the robot's own: 1 = 45 degrees, and so on.
     numbers = made["aerial_random_8-nearest"].headings[:, 0]
     np.testing.assert_array_equal(numbers, np.rint(towns.queries.heading_rad / (np.pi / 4)).astype(int) % 8)
