@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -65,9 +67,12 @@ def open_benchmark(
     settings = _plain(amsterdam.settings_of(benchmark, surveys, preprocessing))
     folder = _folder(data, name, settings)
     made = _current(folder, settings)
-    if made is None:
-        save_set(folder, amsterdam.make_amsterdam_set(benchmark, surveys, preprocessing, data, report), settings)
-        made = load_set(folder, verify=True)
+    if made is not None:
+        return made
+    with _alone(folder):
+        if (made := _current(folder, settings)) is None:
+            save_set(folder, amsterdam.make_amsterdam_set(benchmark, surveys, preprocessing, data, report), settings)
+            made = load_set(folder, verify=True)
     return made
 
 
@@ -82,9 +87,16 @@ def _open_simulated(
     settings = _plain(simulated.settings_of(benchmark, preprocessing))
     folder = _folder(data, name, settings)
     folders = {town: folder / f"{town.family}_{town.seed}" for town in benchmark.towns}
-    made = {town: found for town in benchmark.towns if (found := _current(folders[town], settings)) is not None}
-    missing = [town for town in benchmark.towns if town not in made]
-    if missing:
+
+    def finished() -> dict[BenchmarkTown, EvaluationSet]:
+        return {town: found for town in benchmark.towns if (found := _current(folders[town], settings)) is not None}
+
+    made = finished()
+    if len(made) == len(benchmark.towns):
+        return join_sets(name, [made[town] for town in benchmark.towns])
+    with _alone(folder):
+        made = finished()
+        missing = [town for town in benchmark.towns if town not in made]
         done, total = len(made), len(benchmark.towns)
         report("making", done, total, "towns")
 
@@ -93,7 +105,6 @@ def _open_simulated(
             done += towns
             report("making", done, total, "towns")
 
-        folder.mkdir(parents=True, exist_ok=True)
         tasks = [_TownTask(town, benchmark, preprocessing, folders[town], settings) for town in missing]
         nobody = cast(DescriptorEncoder, None)  # towns are made without an encoder
         with open_workers(_no_encoder, nobody, workers, None, folder) as pool:
@@ -101,6 +112,23 @@ def _open_simulated(
                 pass
         made |= {town: load_set(folders[town], verify=True) for town in missing}
     return join_sets(name, [made[town] for town in benchmark.towns])
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Wait until no other process makes the same set; what it has made is found then."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        lock = folder.with_name(f".{folder.name}.lock").open("w")
+    except OSError as error:
+        raise EvaluationError(f"cannot write in {folder.parent}: {error.strerror or error}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _log.warning("another process makes %s: waiting for it", folder)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _make_town(task: _TownTask, advance: Callable[[int], None] | None) -> None:
