@@ -11,6 +11,9 @@ from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.types import Float32Array
 
+_THING_RADIUS_M = (1.0, 6.0)
+_THING_HEIGHT_M = (1.5, 12.0)
+_THING_POINTS = (20, 300)
 _PAPER_DROP = 0.1
 _PAPER_SHIFT = 0.01
 _PAPER_CUBOID_SHARE = 0.4
@@ -28,6 +31,31 @@ def occlude(points: Float32Array, rng: np.random.Generator, config: TrainConfig)
         width = rng.uniform(0.0, math.pi / 2.0)
         kept &= np.mod(bearing - rng.uniform(0.0, 2.0 * math.pi), 2.0 * math.pi) >= width
     return points[kept]
+
+
+def change(points: Float32Array, half_extent_m: float, rng: np.random.Generator, config: TrainConfig) -> Float32Array:
+    """Return the points (n, 3) of a place, in metres, as another day and another sensor would have them.
+
+    Fewer of them, each a little displaced, some things gone and others come: what a survey years old, flown with
+    another density, never shares with a scan of today. `config` says how much of each.
+    """
+    kept = rng.random(len(points)) < rng.uniform(config.keep_survey, 1.0)
+    for _ in range(rng.poisson(config.changes)):
+        middle = rng.uniform(-half_extent_m, half_extent_m, 2)
+        kept &= np.hypot(*(points[:, :2] - middle).T) > rng.uniform(*_THING_RADIUS_M)
+    parts = [points[kept]]
+    for _ in range(rng.poisson(config.changes)):
+        count = int(rng.integers(*_THING_POINTS))
+        radius, top = rng.uniform(*_THING_RADIUS_M), rng.uniform(*_THING_HEIGHT_M)
+        middle = rng.uniform(-half_extent_m, half_extent_m, 2)
+        thing = np.column_stack([rng.normal(middle, 0.5 * radius, (count, 2)), rng.uniform(0.0, top, count)])
+        parts.append(thing.astype(np.float32))
+    changed = np.concatenate(parts)
+    if config.displacement_m > 0.0:
+        sigma = rng.uniform(0.0, config.displacement_m)
+        changed = changed + rng.normal(0.0, sigma, changed.shape).astype(np.float32)
+        changed[:, 2] += np.float32(rng.normal(0.0, config.displacement_m))
+    return changed
 
 
 def paper_cloud(points: Float32Array, rng: np.random.Generator) -> Float32Array:

@@ -13,7 +13,7 @@ from numba import njit
 from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.training.augmentation import occlude, paper_batch, paper_cloud
+from crossloc3d_ros.training.augmentation import change, occlude, paper_batch, paper_cloud
 from crossloc3d_ros.training.shards import TrainingTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
@@ -201,12 +201,12 @@ class BatchSampler:
                 if pair is not None:
                     return pair
                 continue
-            scan = make_patch(
-                occlude(town.scan_points(index), rng, config), preprocessing.scan_half_extent_m, preprocessing
-            )
+            seen = occlude(town.scan_points(index), rng, config)
+            scan = make_patch(seen, preprocessing.scan_half_extent_m, preprocessing)
             centre = self._centre(place, rng)
             heading = wish.heading_rad if wish is not None else float(rng.uniform(0.0, 2.0 * math.pi))
             submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
+            submap_points = change(submap_points, preprocessing.half_extent_m, rng, config)
             mirrored = bool(rng.integers(2))
             if mirrored:
                 submap_points[:, 1] *= -1.0
