@@ -208,9 +208,15 @@ class TrainConfig:
     mined_places: int = option(2048, "places of all towns that a search compares", low=2, high=1_000_000)
     augmentation: Literal["full_circle", "paper"] = option("full_circle", "headings and occlusions, or the paper's")
     keep_points: float = option(0.8, "least share of a scan's points that augmentation keeps", low=0.1, high=1.0)
+    keep_survey: float = option(1.0, "least share of a survey's points that augmentation keeps", low=0.05, high=1.0)
+    changes: float = option(
+        0.0, "mean number of things that go from a submap, and of those that come", low=0.0, high=99
+    )
+    displacement_m: float = option(0.0, "largest noise of a survey's points, and its height's", low=0.0, high=10.0)
     sector_share: float = option(0.3, "share of scans with a blocked sector of up to 90 degrees", low=0.0, high=1.0)
     seed: int = option(1, "of weights, batches and augmentation", low=0, high=2**31 - 1)
     threads: int = option(1, "of torch", low=1, high=256)
+    workers: int = option(0, "threads that draw the next batches meanwhile; 0 = none", low=0, high=64)
     device: Literal["cpu", "cuda"] = option("cpu", "where to train")
     precision: Literal["float32", "bfloat16"] = option("float32", "of matrix products; bfloat16 is for CUDA")
     save_minutes: float = option(4.0, "between saved states", low=0.01, high=1e4)
