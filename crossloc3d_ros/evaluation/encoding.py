@@ -115,7 +115,7 @@ def time_queries(
     angles = 2.0 * math.pi * np.arange(headings) / headings
     encode_ms, search_ms = [], []
     for i in range(min(len(places), _TIMED_QUERIES + 1)):
-        cloud = np.asarray(places.patches[i])
+        cloud = np.array(places.patches[i])
         started = time.perf_counter()
         descriptors = encoder.encode_batch([turn(cloud, float(angle)) for angle in angles])
         encoded = time.perf_counter()
@@ -134,7 +134,7 @@ def _chunks(
 ) -> Iterator[tuple[_Chunk, int]]:
     for start in missing:
         end = min(start + per_chunk, len(places))
-        clouds = [np.ascontiguousarray(places.patches[i]) for i in range(start, end)]
+        clouds = [np.array(places.patches[i]) for i in range(start, end)]  # what is mapped is read-only
         yield _Chunk(folder / f"{start:08d}.npy", clouds, angles_rad[start:end]), end - start
 
 

@@ -159,7 +159,7 @@ def make_town_set(
     epoch = town.seed % 2
     submaps = _submaps(town, epoch, benchmark, preprocessing)
     queries = _scans(town, 1 - epoch, benchmark.queries, benchmark, preprocessing)
-    ground = _scans(town, 2, benchmark.ground, benchmark, preprocessing)
+    ground = _scans(town, 2, benchmark.ground, benchmark, preprocessing) if benchmark.ground else None
     groups = (HELD_OUT if town.held_out else SEEN,) * len(queries)
     return EvaluationSet(town.name, queries, submaps, ground, (town.name,), (town.family,), groups)
 

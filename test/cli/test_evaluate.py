@@ -1,0 +1,159 @@
+"""`evaluate` writes predictions, scores them, and says clearly what it cannot use."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crossloc3d_ros.cli import evaluate
+from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.evaluation import benchmark as benchmarks
+from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
+from crossloc3d_ros.evaluation.predictions import load_predictions
+from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
+from crossloc3d_ros.simulation.survey import SurveyConfig
+
+TINY = SimulatedBenchmark(
+    (BenchmarkTown("suburb", 990_001, False), BenchmarkTown("campus", 990_002, True)),
+    town_size_m=160.0, queries=8, ground=4, border_m=40.0, flight=SurveyConfig(spacing_m=1.0),
+    build=BuildConfig(spacing_m=19.0),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tiny() -> object:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(benchmarks.BENCHMARKS, "simulated_small", TINY)
+        yield
+
+
+@pytest.fixture(scope="module")
+def evaluated(tiny: object, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """Run the command on two small towns; return the output folder and the arguments."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    arguments = [
+        "--weights", str(weights), "--benchmark", "simulated_small", "--query-headings", "1", "4",
+        "--data", str(folder / "data"), "--output", str(folder / "out"),
+    ]  # fmt: skip
+    assert evaluate.main(arguments) == 0
+    return folder / "out", arguments
+
+
+def test_everything_is_written(evaluated: tuple[Path, list[str]]) -> None:
+    output, _ = evaluated
+    names = {path.stem for path in (output / "predictions").iterdir()}
+    each = {"aligned", "random", "random_4-mean", "random_4-nearest"}
+    assert names == {f"{setting}_{way}" for setting in ("aerial", "aerial_ground") for way in each}
+    rows = list(csv.DictReader((output / "results.csv").open()))
+    assert {row["divided_by"] for row in rows} == {"all", "group", "family", "area"}
+    assert {row["name"] for row in rows if row["divided_by"] == "family"} == {"suburb", "campus"}
+    for row in rows:
+        if row["counted"] != "0":
+            assert float(row["low"]) <= float(row["recall"]) <= float(row["high"])
+    content = json.loads((output / "results.json").read_text())
+    assert len(content) == 8
+    predictions = load_predictions(output / "predictions" / "aerial_random.npz")
+    assert predictions.about.encoder == content[0]["about"]["encoder"]
+
+
+def test_the_page_needs_nothing_but_itself(evaluated: tuple[Path, list[str]]) -> None:
+    page = (evaluated[0] / "index.html").read_text()
+    assert not re.search(r'(?:src|href)="(?!data:)', page)
+    assert "http" not in re.sub(r'src="data:[^"]*"', "", page)
+    assert "{{" not in page
+    assert page.count("<figure") >= 6
+    for word in ("by lot", "AR@1%", "random heading", "north-aligned"):
+        assert word in page
+
+
+def test_scoring_again_needs_no_encoding(evaluated: tuple[Path, list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    output, arguments = evaluated
+    before = {name: (output / name).read_text() for name in ("results.csv", "results.json")}
+    (output / "results.csv").unlink()
+    monkeypatch.setattr(evaluate, "predict_all", lambda *_: pytest.fail("nothing must be predicted"))
+    assert evaluate.main([*arguments, "--only-score"]) == 0
+    assert {name: (output / name).read_text() for name in before} == before
+
+
+def test_the_table_fits_a_terminal(
+    evaluated: tuple[Path, list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert evaluate.main([*evaluated[1], "--only-score"]) == 0
+    shown = capsys.readouterr().out
+    assert "aerial, random heading" in shown
+    assert "…" not in shown
+    assert all(len(line) <= 80 for line in shown.splitlines() if "/" not in line)
+
+
+def test_scan_context_takes_the_place_of_weights(evaluated: tuple[Path, list[str]], tmp_path: Path) -> None:
+    data = evaluated[1][evaluated[1].index("--data") + 1]
+    arguments = ["--method", "scan_context", "--benchmark", "simulated_small", "--data", data, "--heading", "random"]
+    assert evaluate.main([*arguments, "--setting", "aerial", "--output", str(tmp_path / "out")]) == 0
+    (content,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert content["about"]["weights"] == "Scan Context"
+
+
+def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    assert evaluate.main(arguments) == 2
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error:"))
+    return line
+
+
+def test_bad_input_is_one_clear_line(
+    evaluated: tuple[Path, list[str]], weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, arguments = evaluated
+    assert "no such weights" in fails(["--weights", str(tmp_path / "none.safetensors")], capsys)
+    (tmp_path / "photo.safetensors").write_bytes(b"\xff\xd8 a photo")
+    assert "cannot be read" in fails(["--weights", str(tmp_path / "photo.safetensors")], capsys)
+    assert "no weights" in fails(["--weights", str(weights), "--method", "scan_context"], capsys)
+    assert "--workers" in fails([*arguments, "--workers", "0"], capsys)
+    assert "query_headings" in fails([*arguments, "--query-headings", "0"], capsys)
+    missing = ["--weights", str(weights), "--dataset", str(tmp_path / "missing")]
+    assert str(tmp_path / "missing") in fails(missing, capsys)
+    surveys = ["--weights", str(weights), "--benchmark", "amsterdam", "--surveys", str(tmp_path)]
+    assert "ahn2_2010.laz" in fails([*surveys, "--data", str(tmp_path / "data")], capsys)
+    nothing = [*arguments, "--output", str(tmp_path / "empty"), "--only-score"]
+    assert "no predictions" in fails(nothing, capsys)
+    shutil.copytree(output, tmp_path / "copy")
+    (tmp_path / "copy" / "predictions" / "aerial_random.npz").write_bytes(b"cut")
+    assert "damaged" in fails([*arguments, "--output", str(tmp_path / "copy"), "--only-score"], capsys)
+
+
+def test_predictions_of_another_benchmark_are_not_scored(
+    evaluated: tuple[Path, list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = dataclasses.replace(TINY, towns=TINY.towns[:1], queries=2)
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "simulated_small", other)
+    assert "another set" in fails([*evaluated[1], "--only-score"], capsys)
+
+
+def test_a_setting_that_the_benchmark_lacks_is_told(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tiny: object
+) -> None:
+    alone = dataclasses.replace(TINY, towns=TINY.towns[:1], queries=2, ground=0)
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "simulated_small", alone)
+    arguments = ["--weights", str(weights), "--benchmark", "simulated_small", "--setting", "aerial+ground"]
+    assert "no ground database" in fails([*arguments, "--data", str(tmp_path)], capsys)
+
+
+@pytest.mark.slow
+def test_amsterdam_is_made_of_the_two_surveys(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = AmsterdamBenchmark(drive_every_m=60.0, spread=10, build=BuildConfig(spacing_m=57.0))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "amsterdam", small)
+    arguments = ["--weights", str(weights), "--benchmark", "amsterdam", "--data", str(tmp_path / "data")]
+    assert evaluate.main([*arguments, "--output", str(tmp_path / "out"), "--heading", "random"]) == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "results.csv").open()))
+    groups = {row["name"]: int(row["queries"]) for row in rows if row["divided_by"] == "group"}
+    assert set(groups) == {"the demo's drive", "all streets"}
+    assert groups["the demo's drive"] >= 9
+    assert np.isfinite([float(row["recall"]) for row in rows if row["counted"] != "0"]).all()
