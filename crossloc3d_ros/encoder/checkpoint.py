@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -56,7 +57,7 @@ def save_checkpoint(
     metadata: Mapping[str, str] | None = None,
     dtype: Literal["float16", "float32"] = "float16",
 ) -> None:
-    """Write the model atomically; a weight beyond the range of float16 raises CheckpointError."""
+    """Write the model atomically; a weight beyond the range of float16, or a full disk, raises CheckpointError."""
     state: dict[str, Tensor] = {}
     for key, tensor in model.state_dict().items():
         value = tensor.detach().cpu().contiguous()
@@ -73,13 +74,16 @@ def save_checkpoint(
         "model": json.dumps(to_dict(model.config), sort_keys=True),
         "preprocessing": json.dumps(to_dict(preprocessing), sort_keys=True),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         save_file(state, partial, metadata=header)
         partial.replace(path)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"cannot write {path}: {error}; nothing was written") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -7,7 +7,8 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.ahead import BatchesAhead
 from crossloc3d_ros.training.curve import write_curve
 from crossloc3d_ros.training.gradients import batch_loss, tensors
 from crossloc3d_ros.training.initial import Initial, read_initial, take_over
@@ -88,7 +90,8 @@ class Trainer:
         sampler = material.sampler(config)
         held_out = material.validation_towns(config)
         log, state = self._begin(initial, resume=resume)
-        self._learn(state, sampler, held_out, log)
+        with _drawn_ahead(sampler, config.workers) as batches:
+            self._learn(state, batches, held_out, log)
         state.averaged = with_fresh_norms(state.averaged, sampler, config)
         validation = self._validate(state, held_out, log, state.averaged)
         run_folder.save_state(self.folder, state.to_dict())
@@ -112,10 +115,10 @@ class Trainer:
         """Return the state to go on from and the log: the saved state, or the one that the run begins with."""
         state = new_state(self.config)
         saved = run_folder.load_state(self.folder) if resume else None
-        log = run_folder.Log(self.folder, saved["step"] if saved is not None else -1)
         if saved is not None:
             state.load_dict(saved)
-        elif initial is not None:
+        log = run_folder.Log(self.folder, -1 if saved is None else state.step)
+        if saved is None and initial is not None:
             taken = take_over(state.model, initial)
             state.averaged.load_state_dict(state.model.state_dict())
             logger.info("%s: %s", initial.path, taken.sentence())
@@ -296,6 +299,16 @@ def encode(model: Network, clouds: Sequence[Float32Array], device: str) -> Float
         for i in range(0, len(clouds), _ENCODE_BATCH)
     ]
     return np.concatenate(parts)
+
+
+@contextmanager
+def _drawn_ahead(sampler: Sampler, workers: int) -> Iterator[Sampler]:
+    """Give a sampler that draws ahead in threads, or the same one without threads."""
+    if workers == 0:
+        yield sampler
+        return
+    with closing(BatchesAhead(sampler, workers)) as batches:
+        yield batches
 
 
 def _scale(criterion: nn.Module) -> float | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from crossloc3d_ros.config import PreprocessingConfig, TrainConfig, from_dict
+from crossloc3d_ros.config import PreprocessingConfig, TrainConfig, from_dict, to_dict
 from crossloc3d_ros.errors import ConfigError, DatasetError, TrainingError
 from crossloc3d_ros.formats.cs_campus3d import preset_of
 from crossloc3d_ros.training import own_data
@@ -147,13 +147,16 @@ def _check_preprocessing(folder: Path, manifest: Manifest, preprocessing: Prepro
     if made_for is None:
         return
     try:
-        same = from_dict(PreprocessingConfig, made_for) == preprocessing
+        theirs = to_dict(from_dict(PreprocessingConfig, made_for))
     except (ConfigError, AttributeError) as error:
         raise TrainingError(f"{folder}: the manifest's preprocessing cannot be used ({error})") from error
-    if not same:
+    other = [
+        f"{key} {theirs[key]}, not {value}" for key, value in to_dict(preprocessing).items() if theirs[key] != value
+    ]
+    if other:
         raise TrainingError(
-            f"the places in {folder} were made for another preprocessing ({made_for}); make them anew with these "
-            "settings, or train with theirs"
+            f"the places in {folder} were made for another preprocessing ({'; '.join(other)}): make them anew with "
+            "these settings, or train with theirs"
         )
 
 

@@ -33,7 +33,7 @@ FINAL = "final.safetensors"
 MODEL_CARD = "MODEL_CARD.md"
 CURVE = "progress.html"
 
-_FREE_TO_CHANGE = {"threads", "device", "save_minutes", "validation_minutes", "log_steps", "turns"}
+_FREE_TO_CHANGE = {"threads", "workers", "device", "save_minutes", "validation_minutes", "log_steps", "turns"}
 """Settings that a resumed run may change: they do not touch the weights."""
 
 
@@ -144,7 +144,10 @@ def save_state(folder: Path, state: dict[str, Any]) -> None:
         partial.replace(folder / STATE)
     except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
         partial.unlink(missing_ok=True)
-        raise TrainingError(f"cannot write the state of the run into {folder}: {error}") from error
+        reason = error.__context__ if isinstance(error.__context__, OSError) else error
+        raise TrainingError(
+            f"cannot write the state of the run into {folder}: {reason}; the one before is kept, go on by `--resume`"
+        ) from error
 
 
 def load_state(folder: Path) -> dict[str, Any] | None:
@@ -242,7 +245,4 @@ def metadata(
 
 def export(path: Path, model: Network, config: TrainConfig, extra: dict[str, str]) -> None:
     """Write weights as float16 safetensors with model, preprocessing and `extra` inside, whole or not at all."""
-    try:
-        save_checkpoint(path, model, config.preprocessing, extra, dtype="float16")
-    except OSError as error:
-        raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
+    save_checkpoint(path, model, config.preprocessing, extra, dtype="float16")
