@@ -68,11 +68,11 @@ def gallery(
     query_north, database_north = north_angles(queries), north_angles(database)
 
     def row(i: int) -> Row:
-        area = evaluation_set.area_names[queries.area[i]]
+        area = evaluation_set.area_names[queries.area[i]].replace("_", " ")
         picture = _picture(queries, i, float(query_north[i, 0]), half_extent_m, area, None)
         answers = []
         for place, apart in zip(predictions.ids[i, :TOP], metres[i, :TOP], strict=True):
-            other = evaluation_set.area_names[database.area[place]]
+            other = evaluation_set.area_names[database.area[place]].replace("_", " ")
             caption = f"{apart:,.0f} m" if math.isfinite(apart) else f"in {other}"
             if place >= len(evaluation_set.aerial):
                 caption += ", scan"
