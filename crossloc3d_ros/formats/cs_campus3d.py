@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from crossloc3d_ros.errors import DatasetError
 from crossloc3d_ros.formats.plain_pickle import read_plain_pickle
@@ -262,7 +263,7 @@ def write_cloud(folder: Path, file: str, points: Any) -> None:
 
 
 def write_training(
-    path: Path, clouds: CloudTable, pairs: Iterable[tuple[Sequence[int], Sequence[int]]], first_id: int = 0
+    path: Path, clouds: CloudTable, pairs: Iterable[tuple[npt.ArrayLike, npt.ArrayLike]], first_id: int = 0
 ) -> None:
     """Write a training pickle entry by entry, whole or not at all; `pairs` gives positives and negatives of each cloud.
 
@@ -275,8 +276,8 @@ def write_training(
         for row, (positives, negatives) in enumerate(pairs):
             entry = {
                 "query": clouds.files[row],
-                "positives": [int(i) for i in positives],
-                "negatives": [int(i) for i in negatives],
+                "positives": np.asarray(positives, np.int64).tolist(),
+                "negatives": np.asarray(negatives, np.int64).tolist(),
                 **_place(clouds, row),
             }
             for part in (first_id + row, entry):

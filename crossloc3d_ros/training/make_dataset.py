@@ -44,6 +44,7 @@ from crossloc3d_ros.formats.las import expand_inputs
 from crossloc3d_ros.places.aerial_patches import AerialPatches, cut_aerial
 from crossloc3d_ros.places.builder import read_headers
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION, Areas, Roles, cut_areas
+from crossloc3d_ros.types import Int64Array
 
 log = logging.getLogger(__name__)
 
@@ -196,12 +197,12 @@ class _Dataset:
                 f"within {config.positive_m:g} m of each other: record where the survey is, or name other areas"
             )
 
-        def pairs() -> Iterator[tuple[list[int], list[int]]]:
+        def pairs() -> Iterator[tuple[list[int], Int64Array]]:
             for row in range(len(clouds)):
                 positives = [other for other in same[row] if other != row]
                 offsets = clouds.xy_m - clouds.xy_m[row]
                 far = np.hypot(offsets[:, 0], offsets[:, 1]) > config.negative_m
-                yield positives, np.flatnonzero(far).tolist()
+                yield positives, np.flatnonzero(far)
 
         write_training(path, clouds, pairs())
 
