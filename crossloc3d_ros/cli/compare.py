@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder in which benchmarks and descriptors are kept (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--surveys", type=Path, help="folder of the two Amsterdam surveys (default: maps/amsterdam)")
-    parser.add_argument("--workers", type=int, default=1, help="processes that encode (default: %(default)s)")
+    parser.add_argument("--encode-workers", type=int, default=1, help="processes that encode (default: %(default)s)")
     parser.add_argument("--only-table", action="store_true", help="write the table of the rows that are done")
     parser.add_argument("--config", type=Path, help="YAML file of which `train` is read")
     common.add_options(parser, TrainConfig)
@@ -108,14 +108,14 @@ def _comparison(
             raise ConfigError("name the places to learn from by --places")
         if arguments.budget_minutes is None and arguments.budget_steps is None:
             raise ConfigError("give each row a budget: --budget-minutes or --budget-steps")
-    if arguments.workers < 1:
-        raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    if arguments.encode_workers < 1:
+        raise ConfigError(f"--encode-workers must be at least 1, got {arguments.encode_workers}")
     none_given = arguments.budget_minutes is None and arguments.budget_steps is None
     evaluation_set = open_benchmark(
         arguments.benchmark,
         arguments.data,
         config.preprocessing,
-        workers=arguments.workers,
+        workers=arguments.encode_workers,
         surveys=find_surveys(arguments.surveys) if arguments.benchmark == "amsterdam" else None,
         progress=display,
     )
@@ -136,7 +136,7 @@ def _comparison(
         evaluation_set=evaluation_set,
         preprocessing=config.preprocessing,
         cache=arguments.data / "descriptors",
-        workers=arguments.workers,
+        workers=arguments.encode_workers,
         report=report,
         encoding=display,
     )
