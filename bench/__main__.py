@@ -14,7 +14,7 @@ import resource
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from bench.figure import Figure
 from bench.flops import descriptor_flops
+from bench.simulation import bench_simulation
 from crossloc3d_ros.cli.common import ProgressDisplay, console, run
 from crossloc3d_ros.cli.demo import DRIVE_SURVEY, MAP_SURVEY, TOPIC, DemoDrive, find_surveys, make_drive
 from crossloc3d_ros.clouds.scan import prepare_scan
@@ -41,23 +43,12 @@ SEARCHED = (27_520, 1_000_000)
 """Sizes of map to search besides the real one: the published dataset's, and a state's."""
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One measured number."""
-
-    name: str
-    value: float
-    unit: str
-    target: str = ""
-    share_of_peak: float | None = None
-    note: str = ""
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(prog="bench", description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("out/bench"), help="folder (default: %(default)s)")
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
+    parser.add_argument("--only", choices=("simulation",), help="measure this part alone")
     parser.add_argument("--runs", type=int, default=40, help="repetitions of each timing (default: %(default)s)")
     arguments = parser.parse_args(argv)
     return run(lambda: _bench(arguments))
@@ -67,6 +58,9 @@ def _bench(arguments: argparse.Namespace) -> None:
     output: Path = arguments.output
     output.mkdir(parents=True, exist_ok=True)
     target = console()
+    if arguments.only == "simulation":
+        _finish(bench_simulation(), output, target)
+        return
     encoder = load_encoder(arguments.weights)
     began = time.perf_counter()
     encoder.warm_up()
@@ -84,6 +78,12 @@ def _bench(arguments: argparse.Namespace) -> None:
     aerial_map = AerialMap.load(output / "map", encoder.fingerprint)
     figures += bench_search(aerial_map, arguments.runs)
     figures += bench_node(output, aerial_map, arguments.weights)
+    figures += bench_simulation()
+    _finish(figures, output, target)
+
+
+def _finish(figures: list[Figure], output: Path, target: Console) -> None:
+    """Show the figures and write them down."""
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     figures.append(Figure("memory of this process at most", peak_mb, "MB"))
     show(figures)

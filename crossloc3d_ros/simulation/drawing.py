@@ -9,6 +9,11 @@ from crossloc3d_ros.simulation.layout import Plan, Rect
 Generator = np.random.Generator
 
 
+def within(rng: Generator, low: float, high: float) -> float:
+    """Return a place between two bounds, the lower one where a block is too small for the upper."""
+    return float(rng.uniform(low, max(low, high)))
+
+
 def town_house(
     plan: Plan, rect: Rect, eave: float, rng: Generator, *, front_along_u: bool, flat: float = 0.25, gable: float = 0.45
 ) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from crossloc3d_ros.simulation.canals import KINDS as CANAL_KINDS
 from crossloc3d_ros.simulation.canals import draw_quays
-from crossloc3d_ros.simulation.drawing import divide, parking_rows, row_houses, rows_of_trees, scatter_trees
+from crossloc3d_ros.simulation.drawing import divide, parking_rows, row_houses, rows_of_trees, scatter_trees, within
 from crossloc3d_ros.simulation.harbour import KINDS as HARBOUR_KINDS
 from crossloc3d_ros.simulation.layout import Belt, Layout, Plan, Rect, Street
 from crossloc3d_ros.simulation.scene import Label
@@ -186,7 +186,7 @@ def _square(plan: Plan, rect: Rect, rng: Generator) -> None:
         plan.poles.append((u, v, rng.uniform(5, 14), 0.9, 0.4, float(Label.STRUCTURE)))
     if rng.random() < 0.5:
         for _ in range(int(rng.integers(4, 18))):
-            u, v = rng.uniform(rect.u0 + 6, rect.u1 - 6), rng.uniform(rect.v0 + 6, rect.v1 - 6)
+            u, v = within(rng, rect.u0 + 6, rect.u1 - 6), within(rng, rect.v0 + 6, rect.v1 - 6)
             plan.wing(plan.owner(u, v), Rect(u - 1.6, v - 1.2, u + 1.6, v + 1.2), 2.5, 3.0, bottom=2.1,
                       label=Label.STRUCTURE)  # fmt: skip
     parking_rows(plan, Rect(rect.u0, rect.v0, rect.u1, rect.v0 + 6), rng, chance=0.5)
@@ -513,7 +513,7 @@ def _garden(plan: Plan, rect: Rect, rng: Generator) -> None:
     """A park: clusters of trees, open lawn, a pond, avenues, a pavilion."""
     plan.pedestrians.append(rect.inset(3))
     for _ in range(max(1, int(rect.width * rect.height / rng.uniform(600, 1800)))):
-        u, v = rng.uniform(rect.u0 + 3, rect.u1 - 3), rng.uniform(rect.v0 + 3, rect.v1 - 3)
+        u, v = within(rng, rect.u0 + 3, rect.u1 - 3), within(rng, rect.v0 + 3, rect.v1 - 3)
         spread = rng.uniform(3, 14)
         for _ in range(int(rng.integers(1, 9))):
             a, b = u + spread * rng.standard_normal(), v + spread * rng.standard_normal()
@@ -523,7 +523,7 @@ def _garden(plan: Plan, rect: Rect, rng: Generator) -> None:
     if rng.random() < 0.4 and min(rect.width, rect.height) > 40:
         plan.water.append(rect.inset(rng.uniform(12, 18)))
     if rng.random() < 0.4:
-        u, v = rng.uniform(rect.u0 + 6, rect.u1 - 6), rng.uniform(rect.v0 + 6, rect.v1 - 6)
+        u, v = within(rng, rect.u0 + 6, rect.u1 - 6), within(rng, rect.v0 + 6, rect.v1 - 6)
         size = rng.uniform(3, 6)
         plan.wing(plan.owner(u, v), Rect(u - size, v - size, u + size, v + 0.7 * size), 3.2, 5.0, hip=0.4)
     if rng.random() < 0.4:

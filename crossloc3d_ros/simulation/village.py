@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from crossloc3d_ros.simulation.drawing import divide, scatter_trees
+from crossloc3d_ros.simulation.drawing import divide, scatter_trees, within
 from crossloc3d_ros.simulation.layout import Plan, Rect
 from crossloc3d_ros.simulation.scene import Label
 
@@ -121,7 +121,7 @@ def _orchard(plan: Plan, rect: Rect, rng: Generator) -> None:
                 if rng.random() < 0.85:
                     plan.tree(u, v, rng, height=(0.8 * tall, 1.2 * tall), kinds=(0.85, 0.0, 0.0, 0.15))
     if rng.random() < 0.6:
-        u, v = rng.uniform(inner.u0, inner.u1 - 5), rng.uniform(inner.v0, inner.v1 - 5)
+        u, v = within(rng, inner.u0, inner.u1 - 5), within(rng, inner.v0, inner.v1 - 5)
         plan.wing(plan.owner(u, v), Rect(u, v, u + 4, v + 3.2), 2.3, 3.4)
     _fence(plan, rect.inset(0.7), rng)
 
@@ -130,12 +130,12 @@ def _meadow(plan: Plan, rect: Rect, rng: Generator) -> None:
     """Open grass with a pond, single old trees, bales and posts, between hedges."""
     scatter_trees(plan, rect.inset(3), rng, per_hectare=rng.uniform(4, 22), height=(9.0, 19.0))
     for _ in range(rng.poisson(5)):
-        u, v = rng.uniform(rect.u0 + 3, rect.u1 - 3), rng.uniform(rect.v0 + 3, rect.v1 - 3)
+        u, v = within(rng, rect.u0 + 3, rect.u1 - 3), within(rng, rect.v0 + 3, rect.v1 - 3)
         plan.poles.append((u, v, 1.3, 0.7, 0.7, float(Label.STRUCTURE)))
     if rng.random() < 0.4 and min(rect.width, rect.height) > 45:
         plan.water.append(rect.inset(0.36 * min(rect.width, rect.height)))
     if rng.random() < 0.5:
-        u, v = rng.uniform(rect.u0 + 4, rect.u1 - 16), rng.uniform(rect.v0 + 4, rect.v1 - 12)
+        u, v = within(rng, rect.u0 + 4, rect.u1 - 16), within(rng, rect.v0 + 4, rect.v1 - 12)
         plan.wing(plan.owner(u, v), Rect(u, v, u + rng.uniform(6, 12), v + rng.uniform(5, 8)), 2.8, 4.4)
     _fence(plan, rect.inset(0.7), rng)
 
