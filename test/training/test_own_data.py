@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.config import PreprocessingConfig, TrainConfig
+from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
 from crossloc3d_ros.errors import DatasetError, TrainingError
 from crossloc3d_ros.evaluation.published import open_source
 from crossloc3d_ros.formats.cs_campus3d import (
@@ -25,8 +25,10 @@ from crossloc3d_ros.formats.cs_campus3d import (
     write_queries,
     write_training,
 )
+from crossloc3d_ros.training.loop import Trainer, export_run
 from crossloc3d_ros.training.own_data import PatchSampler, fingerprint, load_training, load_validation
 from crossloc3d_ros.training.sampling import HardPlaces
+from crossloc3d_ros.training.schedule import Budget
 
 PATCH = PreprocessingConfig(half_extent_m=20.0, scan_half_extent_m=20.0, n_points=64, min_points=8)
 CONFIG = TrainConfig(pairs=8, preprocessing=PATCH, keep_points=1.0, sector_share=0.0, near_share=0.0, neighbour_m=30.0)
@@ -296,3 +298,22 @@ def test_the_fingerprint_changes_with_the_lists(dataset: Callable[..., Path]) ->
     (folder / PLAIN.training).unlink()
     with pytest.raises(DatasetError, match="is missing"):
         fingerprint(folder)
+
+
+def test_a_run_learns_from_a_dataset(dataset: Callable[..., Path], made_places: Path, tmp_path: Path) -> None:
+    folder = dataset()
+    model = ModelConfig(
+        voxel_sizes=(0.2,), kept_branches=0, refinement="none", channels=16, fused_channels=32, clusters=4,
+        descriptor_size=8,
+    )  # fmt: skip
+    config = dataclasses.replace(CONFIG, model=model, hard_share=0.5, mine_steps=1, mined_places=30)
+    trainer = Trainer(config, [folder], tmp_path / "run", Budget(steps=2))
+    assert trainer.run().queries == SCANS
+    assert "layout of CS-Campus3D, preset `plain`" in trainer.write_card().read_text()
+    assert export_run(tmp_path / "run", tmp_path / "shipped" / "own.safetensors").exists()
+    with pytest.raises(TrainingError, match="learned from alone"):
+        Trainer(config, [made_places, folder], tmp_path / "other", Budget(steps=1)).run()
+    training = folder / PLAIN.training
+    training.write_bytes(pickle.dumps({}))
+    with pytest.raises(TrainingError, match="other places"):
+        Trainer(config, [folder], tmp_path / "run", Budget(steps=3)).run(resume=True)
