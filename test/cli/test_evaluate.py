@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import pickle
 import re
 import shutil
 from pathlib import Path
@@ -18,6 +19,7 @@ from crossloc3d_ros.evaluation import benchmark as benchmarks
 from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
 from crossloc3d_ros.evaluation.predictions import load_predictions
 from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
+from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS, write_cloud
 from crossloc3d_ros.simulation.survey import SurveyConfig
 
 TINY = SimulatedBenchmark(
@@ -144,6 +146,38 @@ def test_a_setting_that_the_benchmark_lacks_is_told(
     monkeypatch.setitem(benchmarks.BENCHMARKS, "simulated_small", alone)
     arguments = ["--weights", str(weights), "--benchmark", "simulated_small", "--setting", "aerial+ground"]
     assert "no ground database" in fails([*arguments, "--data", str(tmp_path)], capsys)
+
+
+def test_a_published_dataset_is_evaluated_as_it_is(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(3)
+    preset, folder = PRESETS["campus"], tmp_path / "campus"
+    aerial = [f"umd/umcp_lidar5_cloud_7/aerial/{i}.bin" for i in range(6)]
+    ground = [f"umd/umcp_lidar5_ground_umd_gps_{i}/aerial/{i}.bin" for i in range(5)]
+    for file in (*aerial, *ground):
+        points = rng.uniform(-1, 1, (CLOUD_POINTS, 3))
+        points[:, 2] *= 0.2 if file in aerial else 0.8
+        write_cloud(folder, file, points)
+
+    def entry(file: str, number: int) -> dict[object, object]:
+        return {"query": file, "northing": 4_317_000.0, "easting": 331_500.0 + 30.0 * number}
+
+    both = {i: entry(file, i % 6) for i, file in enumerate([*aerial, *ground])}
+    queries = [[{**entry(file, i), 0: [i]} for i, file in enumerate(ground[:3])]]
+    (folder / preset.database).write_bytes(pickle.dumps([both], 4))
+    (folder / preset.queries).write_bytes(pickle.dumps(queries, 4))
+
+    output = ["--data", str(tmp_path / "data"), "--output", str(tmp_path / "out")]
+    arguments = ["--weights", str(weights), "--dataset", str(folder), *output]
+    assert evaluate.main(arguments) == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "results.csv").open()))
+    databases = {row["setting"]: row for row in rows if row["divided_by"] == "all"}
+    assert set(databases) == {"aerial", "aerial+ground"}
+    assert {row["queries"] for row in databases.values()} == {"3"}
+    assert {row["heading"] for row in rows} == {"aligned", "random"}
+    (folder / aerial[2]).unlink()
+    assert Path(aerial[2]).name in fails(arguments, capsys)
 
 
 @pytest.mark.slow
