@@ -235,6 +235,8 @@ def save_set(folder: Path, evaluation_set: EvaluationSet, settings: Mapping[str,
             folder.rename(replaced)
         partial.rename(folder)
     except OSError as error:
+        if replaced.exists() and not folder.exists():
+            replaced.rename(folder)
         raise EvaluationError(f"cannot write the set {folder}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)

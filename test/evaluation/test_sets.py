@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -71,6 +72,28 @@ def test_a_set_is_replaced_whole_and_other_folders_are_left_alone(tmp_path: Path
     with pytest.raises(EvaluationError, match="something else"):
         save_set(tmp_path / "photos", small_set())
     assert (tmp_path / "photos" / "cat").read_text() == "meow"
+
+
+@pytest.mark.parametrize("moment", ["writing", "moving"])
+def test_a_full_disk_costs_nothing_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str) -> None:
+    save_set(tmp_path / "set", small_set(0))
+    rename = Path.rename
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def rename_fails(path: Path, target: Path) -> Path:
+        return full() if "partial" in path.name else rename(path, target)  # type: ignore[func-returns-value, return-value]
+
+    with monkeypatch.context() as patch:
+        if moment == "writing":
+            patch.setattr(np, "save", full)
+        else:
+            patch.setattr(Path, "rename", rename_fails)
+        with pytest.raises(EvaluationError, match="No space left"):
+            save_set(tmp_path / "set", small_set(1))
+    assert load_set(tmp_path / "set", verify=True).fingerprint() == small_set(0).fingerprint()
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_an_array_of_patches_is_the_same_as_a_list(tmp_path: Path) -> None:
