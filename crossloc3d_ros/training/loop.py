@@ -92,11 +92,11 @@ class Trainer:
         log, state = self._begin(initial, resume=resume)
         with _drawn_ahead(sampler, config.workers) as batches:
             self._learn(state, batches, held_out, log)
-        state.averaged = with_fresh_norms(state.averaged, sampler, config)
-        validation = self._validate(state, held_out, log, state.averaged)
-        run_folder.save_state(self.folder, state.to_dict())
-        metadata = self._metadata(state, validation)
-        run_folder.export(self.folder / run_folder.FINAL, state.averaged, config, metadata)
+        averaged = with_fresh_norms(state.averaged, sampler, config)
+        validation = self._validate(state, held_out, log, averaged)
+        run_folder.save_state(self.folder, state.to_dict())  # before anything else can fail for want of space
+        self._export(state, averaged, validation, run_folder.FINAL)
+        run_folder.save_state(self.folder, state.to_dict())  # with the best recall
         self._draw(live=False)
         return validation
 
@@ -132,57 +132,54 @@ class Trainer:
     def _learn(
         self, state: RunState, sampler: Sampler, held_out: Sequence[ValidationTown], log: run_folder.Log
     ) -> None:
+        """Take steps until the budget is used; log, validate and save now and then."""
         config = self.config
         started = self.clock() - state.elapsed_s
-        last_saved = last_logged = state.elapsed_s
-        logged_clouds = state.clouds
-        losses: list[float] = []
-        bad_steps = 0
+        last_saved = state.elapsed_s
+        meter = _Meter(state)
         while (share := self.budget.share(state.elapsed_s, state.step)) < 1.0:
             if config.hard_share > 0.0 and state.step > 0 and state.step % config.mine_steps == 0:
                 state.hard = self._mine(state, sampler, log)
             rate = learning_rate(share, config)
             loss = take_step(state, sampler, rate, config)
-            if math.isfinite(loss):
-                losses.append(loss)
-                bad_steps = 0
-            else:
-                bad_steps += 1
-                if bad_steps >= _MOST_BAD_STEPS:
-                    raise TrainingError(f"the loss was not finite {bad_steps} times in a row; lower the learning rate")
+            meter.add(loss)
             state.elapsed_s = self.clock() - started
-
             if state.step % config.log_steps == 0:
-                seconds = max(state.elapsed_s - last_logged, 1e-9)
-                samples = (state.clouds - logged_clouds) / seconds
-                mean = float(np.mean(losses)) if losses else math.nan
-                used = max(self.budget.share(state.elapsed_s, state.step), 1e-9)
-                remaining = state.elapsed_s * (1.0 / used - 1.0)
-                self.report(Progress(state.step, used, mean, rate, samples, max(0.0, remaining)))
-                log.write(
-                    "step", step=state.step, elapsed_s=round(state.elapsed_s, 1), loss=round(mean, 5), rate=rate,
-                    samples_per_s=round(samples, 2), clouds=state.clouds, pairs=state.pairs,
-                    scale=_scale(state.criterion),
-                )  # fmt: skip
-                losses.clear()
-                last_logged, logged_clouds = state.elapsed_s, state.clouds
+                self._log_step(state, meter, rate, log)
+                meter = _Meter(state, meter.bad_steps)
             if state.elapsed_s - state.last_validation_s >= 60.0 * config.validation_minutes:
                 state.last_validation_s = state.elapsed_s
                 averaged = with_fresh_norms(state.averaged, sampler, config)
                 validation = self._validate(state, held_out, log, averaged)
-                recall = validation.recall("R@1", 100.0).value
-                metadata = self._metadata(state, validation)
-                run_folder.export(self.folder / f"step_{state.step:06d}.safetensors", averaged, config, metadata)
-                if recall > state.best_recall:
-                    state.best_recall = recall
-                    run_folder.export(self.folder / run_folder.BEST, averaged, config, metadata)
+                self._export(state, averaged, validation, f"step_{state.step:06d}.safetensors")
                 self.report(Progress(state.step, share, loss, rate, 0.0, 0.0, validation))
                 self._draw(live=True)
                 state.elapsed_s = self.clock() - started
-                last_logged, logged_clouds = state.elapsed_s, state.clouds
+                meter = _Meter(state, meter.bad_steps)
             if state.elapsed_s - last_saved >= 60.0 * config.save_minutes:
                 last_saved = state.elapsed_s
                 run_folder.save_state(self.folder, state.to_dict())
+
+    def _log_step(self, state: RunState, meter: _Meter, rate: float, log: run_folder.Log) -> None:
+        """Tell and log where the run stands."""
+        samples, loss = meter.clouds_per_second(state), meter.mean()
+        used = max(self.budget.share(state.elapsed_s, state.step), 1e-9)
+        remaining_s = max(0.0, state.elapsed_s * (1.0 / used - 1.0))
+        self.report(Progress(state.step, used, loss, rate, samples, remaining_s))
+        log.write(
+            "step", step=state.step, elapsed_s=round(state.elapsed_s, 1), loss=round(loss, 5), rate=rate,
+            samples_per_s=round(samples, 2), clouds=state.clouds, pairs=state.pairs, scale=_scale(state.criterion),
+        )  # fmt: skip
+
+    def _export(self, state: RunState, averaged: Network, validation: Validation, name: str) -> None:
+        """Write weights that were just validated, also as the best ones where they are."""
+        history = run_folder.history(self.folder)
+        notes = run_folder.metadata(self.config, state.step, state.elapsed_s, validation, history)
+        run_folder.export(self.folder / name, averaged, self.config, notes)
+        recall = validation.recall("R@1", 100.0).value
+        if recall > state.best_recall:
+            state.best_recall = recall
+            run_folder.export(self.folder / run_folder.BEST, averaged, self.config, notes)
 
     def _draw(self, *, live: bool) -> None:
         """Write the page on how the run goes, once there is something to draw."""
@@ -208,9 +205,33 @@ class Trainer:
         )  # fmt: skip
         return validation
 
-    def _metadata(self, state: RunState, validation: Validation) -> dict[str, str]:
-        history = run_folder.history(self.folder)
-        return run_folder.metadata(self.config, state.step, state.elapsed_s, validation, history)
+
+class _Meter:
+    """What happened since the last line of the log."""
+
+    def __init__(self, state: RunState, bad_steps: int = 0) -> None:
+        self._elapsed_s, self._clouds = state.elapsed_s, state.clouds
+        self._losses: list[float] = []
+        self.bad_steps = bad_steps
+        """Steps in a row, up to the last one, whose loss was not finite."""
+
+    def add(self, loss: float) -> None:
+        """Count a step; raises TrainingError where too many in a row went wrong."""
+        if math.isfinite(loss):
+            self._losses.append(loss)
+            self.bad_steps = 0
+            return
+        self.bad_steps += 1
+        if self.bad_steps >= _MOST_BAD_STEPS:
+            raise TrainingError(f"the loss was not finite {self.bad_steps} times in a row; lower the learning rate")
+
+    def mean(self) -> float:
+        """Return the mean of the finite losses; NaN where there was none."""
+        return float(np.mean(self._losses)) if self._losses else math.nan
+
+    def clouds_per_second(self, state: RunState) -> float:
+        """Return the rate up to `state`."""
+        return (state.clouds - self._clouds) / max(state.elapsed_s - self._elapsed_s, 1e-9)
 
 
 def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
