@@ -25,6 +25,8 @@ from crossloc3d_ros.types import (
     Float64Array,
 )
 
+_LEAST_DISTANCE = 1e-6  # the least that CalibrationConfig admits
+
 
 @dataclass(frozen=True, eq=False)
 class Belief:
@@ -127,9 +129,9 @@ def calibrate(
 
     presence = minimize(presence_loss, [initial.none_distance, np.log(initial.none_scale)], method="Nelder-Mead").x
     choice = minimize(choice_loss, [np.log(initial.temperature)], method="Nelder-Mead").x
-    return CalibrationConfig(
-        temperature=float(np.exp(choice[0])), none_distance=float(presence[0]), none_scale=float(np.exp(presence[1]))
-    )
+    # Where the scans on the map look no more familiar than those outside, the best threshold may lie below zero.
+    none_distance = max(float(presence[0]), _LEAST_DISTANCE)
+    return CalibrationConfig(float(np.exp(choice[0])), none_distance, float(np.exp(presence[1])))
 
 
 def _heaviest_group(enu: Float64Array, probabilities: Float64Array, radius_m: float) -> BoolArray:

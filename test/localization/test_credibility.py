@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from crossloc3d_ros.config import CalibrationConfig, CredibilityConfig
+from crossloc3d_ros.config import CalibrationConfig, CredibilityConfig, from_dict, to_dict
 from crossloc3d_ros.localization.credibility import calibrate, candidate_probabilities, judge
 from crossloc3d_ros.types import Candidates, FixStatus
 
@@ -131,6 +131,17 @@ def test_calibration_finds_the_law_that_made_the_data() -> None:
     assert found.none_distance == pytest.approx(truth.none_distance, abs=0.03)
     assert found.none_scale == pytest.approx(truth.none_scale, rel=0.25)
     assert found.temperature == pytest.approx(truth.temperature, rel=0.15)
+
+
+def test_calibration_of_descriptors_that_tell_nothing_can_be_stored_and_read() -> None:
+    rng = np.random.default_rng(4)
+    # What is on the map looks a little less familiar than what is not, and hardly any scan is on it.
+    inside = [np.sort(rng.uniform(0.5, 0.6, 5)) for _ in range(3)]
+    outside = [np.sort(rng.uniform(0.4, 0.6, 5)) for _ in range(60)]
+    separations = [np.array([5.0, 900, 900, 900, 900])] * 3 + [np.full(5, np.inf)] * 60
+    found = calibrate(inside + outside, separations)
+    assert from_dict(CalibrationConfig, to_dict(found)) == found
+    assert candidate_probabilities(inside[0].astype(np.float32), found).sum() < 0.5
 
 
 def test_calibration_learns_nowhere_from_scans_outside_of_the_map() -> None:
