@@ -20,7 +20,7 @@ from crossloc3d_ros.cli.replay import own_version
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
-from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, write_page
+from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, describe_briefly, write_page
 from crossloc3d_ros.evaluation.encoding import EncodingJob
 from crossloc3d_ros.evaluation.estimates import write_atomically
 from crossloc3d_ros.evaluation.gallery import gallery
@@ -200,14 +200,17 @@ def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
         for each in scores:
             first, *others = (each.overall.figure(figure.label, radius) for figure in figures)
             table.add_row(
-                describe(each.about),
+                describe_briefly(each.about),
                 _percent(first.share.value),
                 f"{100 * first.share.low:.0f}–{100 * first.share.high:.0f}",
                 _percent(first.chance),
                 *(_percent(figure.share.value) for figure in others),
             )
         shown.append(table)
-    shown[-1].caption = "* published as AR@1%: the released evaluators retrieve 25 answers"
+    notes = ["* published as AR@1%: the released evaluators retrieve 25 answers"]
+    if any(each.about.query_headings > 1 for each in scores):
+        notes.append("8 nearest: tried in 8 headings, the nearest kept; 8 mean: by the mean of their descriptors")
+    shown[-1].caption = "\n".join(notes)
     divided = _table(
         f"{describe(main_scores.about)}, %", ["", "queries", *(f"R@1 {r:g} m" for r in RADII_M), "R@25 100 m"]
     )

@@ -71,6 +71,13 @@ def describe(about: About) -> str:
     return f"{about.setting}, {heading}{how}"
 
 
+def describe_briefly(about: About) -> str:
+    """Return the same for narrow tables."""
+    heading = "north" if about.heading == "aligned" else "random"
+    tried = f", {about.query_headings} {about.way}" if about.query_headings > 1 else ""
+    return f"{about.setting}, {heading}{tried}"
+
+
 def _page_file(name: str) -> str:
     return (resources.files("crossloc3d_ros.evaluation") / "page" / name).read_text(encoding="utf-8")
 

@@ -90,7 +90,7 @@ def test_the_table_fits_a_terminal(
     monkeypatch.setenv("COLUMNS", "80")
     assert evaluate.main([*evaluated[1], "--only-score"]) == 0
     shown = capsys.readouterr().out
-    assert "aerial, random heading" in shown
+    assert "aerial, random, 4 nearest" in shown
     assert "…" not in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if "/" not in line)
 
