@@ -78,6 +78,7 @@ def save_checkpoint(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_file(state, partial, metadata=header)
+        partial.chmod(0o644)  # safetensors keeps them from everybody else, also from the robot's user
         partial.replace(path)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; nothing was written") from error

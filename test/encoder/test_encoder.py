@@ -229,3 +229,9 @@ def test_weights_of_another_model_are_refused(model: CrossLoc3D, tmp_path: Path)
 def test_a_patch_of_the_wrong_shape_is_refused(model: CrossLoc3D, shape: tuple[int, ...]) -> None:
     with pytest.raises(CloudError, match=r"\(n, 3\)"):
         Encoder(model, PreprocessingConfig(), "x").encode(np.zeros(shape, np.float32))
+
+
+def test_weights_can_be_read_by_everybody(tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_checkpoint(path, CrossLoc3D(SMALL), PreprocessingConfig())
+    assert path.stat().st_mode & 0o777 == 0o644
