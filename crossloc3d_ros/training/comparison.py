@@ -34,7 +34,7 @@ from crossloc3d_ros.evaluation.predictions import (
     way_of,
 )
 from crossloc3d_ros.evaluation.recall import Share
-from crossloc3d_ros.evaluation.scan_context import ScanContext, ScanContextConfig
+from crossloc3d_ros.evaluation.scan_context import HeightMaps, ScanContext
 from crossloc3d_ros.evaluation.scores import difference, score
 from crossloc3d_ros.evaluation.sets import EvaluationSet
 from crossloc3d_ros.places.workers import EncoderLoader
@@ -65,7 +65,7 @@ class Row:
     name: str
     config: TrainConfig | None
     """How it learns; None: it does not."""
-    method: ScanContextConfig | None = None
+    method: Literal["scan_context", "height_maps"] | None = None
     """What compares without learning."""
     published: tuple[float, float] | None = None
     """The paper's AR@1 and "AR@1%" on CS-Campus3D, per cent."""
@@ -189,8 +189,8 @@ def _competitors(base: TrainConfig) -> list[Row]:
     }
     model = dataclasses.replace(base.model, network="crossloc3d")
     rows = [
-        Row("scan_context", "Scan Context, as published", None, ScanContextConfig(distance="cosine", shift_m=0.0)),
-        Row("height_maps", "polar height maps, masked", None, ScanContextConfig()),
+        Row("scan_context", "Scan Context", None, "scan_context"),
+        Row("height_maps", "height maps, matched", None, "height_maps"),
     ]
     for network, (name, figures) in published.items():
         sized = dataclasses.replace(
@@ -309,7 +309,8 @@ class Comparison:
 
     def _encoder(self, row: Row, folder: Path) -> tuple[DescriptorEncoder, EncoderLoader]:
         if row.config is None:
-            loader: EncoderLoader = functools.partial(ScanContext, self.preprocessing, row.method)
+            method = ScanContext if row.method == "scan_context" else HeightMaps
+            loader: EncoderLoader = functools.partial(method, self.preprocessing)
             return loader(), loader
         path = folder / run_folder.FINAL
         return load_encoder(path), functools.partial(load_encoder, path, threads=1)
