@@ -156,10 +156,9 @@ def polar_maxima(points: Float32Array, rings: int, sectors: int) -> Float32Array
 
     Sectors counter-clockwise from x; points beyond the unit circle do not count.
     """
-    maps: Float32Array = _polar_of_points(
-        np.ascontiguousarray(points, np.float32), np.zeros((1, 2), np.float32), rings, sectors
-    )
-    return maps[0]
+    centre = np.zeros((1, 2), np.float32)
+    around: Float32Array = _polar_of_points(np.ascontiguousarray(points, np.float32), centre, rings, sectors)[0]
+    return around
 
 
 def _spectra(maps: Float32Array) -> Complex64Array:

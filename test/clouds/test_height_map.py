@@ -19,7 +19,7 @@ from crossloc3d_ros.config import from_dict
 from crossloc3d_ros.errors import CloudError, ConfigError
 from crossloc3d_ros.types import Float32Array
 
-CELLS, RINGS, SECTORS = 64, 10, 24
+CELLS, RINGS, SECTORS = 64, 10, 22  # no cell of the raster lies on the border of two sectors
 PLAIN = HeightMapConfig(cells=CELLS, rings=RINGS, sectors=SECTORS, reach=0, smooth=0)
 
 
