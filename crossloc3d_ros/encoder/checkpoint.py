@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 FORMAT = "crossloc3d_ros/1"
 WEIGHTS_FOLDER = Path(__file__).resolve().parents[1] / "weights"
-SHIPPED_WEIGHTS = WEIGHTS_FOLDER / "crossloc3d_first.safetensors"
+SHIPPED_WEIGHTS = WEIGHTS_FOLDER / "crossloc3d.safetensors"
 _SMALL = 4096
 """Tensors of at most this many numbers are never stored as float16."""
 _ALWAYS_COUNTED = {
