@@ -253,8 +253,8 @@ def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int
         },
         notes=(
             "The drive is simulated. The laser was cast through a surface made of the 2014 survey, the map is of 2010, "
-            "so trees have grown and houses have changed; but facades are guessed from above, nothing moves in the "
-            "streets and the sensor has no faults beyond noise. A real drive will be harder.",
+            "so trees have grown and houses have changed; but facades are guessed from above, few people and cars "
+            "move, and the sensor has no faults beyond noise. A real drive will be harder.",
         ),
         footer=f"Written by crossloc3d_ros {own_version()} on {today}. Aerial data: AHN, Rijkswaterstaat / PDOK, CC0.",
         latency_is="from publishing the cloud to receiving the fix, over DDS, between two processes",
