@@ -67,9 +67,9 @@ Shrink = Callable[[Any, Any], Any]
 def read_plain_pickle(path: Path, shrink: Shrink | None = None, *, most_bytes: int = MOST_BYTES) -> Any:
     """Return what a pickle holds: dict, list, tuple, set, str, bytes, numbers, None and arrays of numbers.
 
-    A list of whole numbers alone comes as an int32 or int64 array; an empty one stays a list. `shrink` may replace
-    values before the next one is read. Raises DatasetError for a missing, damaged, cut or oversized file, and for one
-    that names anything but plain things, naming that.
+    A list of whole numbers alone comes as an int32 or int64 array if they fit; an empty one stays a list. `shrink` may
+    replace values before the next one is read. Raises DatasetError for a missing, damaged, cut or oversized file, and
+    for one that names anything but plain things, naming that.
     """
     try:
         with path.open("rb") as file:
@@ -87,6 +87,9 @@ def read_plain_pickle(path: Path, shrink: Shrink | None = None, *, most_bytes: i
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, MemoryError) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise DatasetError(f"{path} is damaged or cut short ({reason}); copy it again from where it came") from error
+
+
+_INT64 = np.iinfo(np.int64)
 
 
 class _Mark:
@@ -344,7 +347,7 @@ def _settled(value: Any) -> Any:
             return np.concatenate([item.values for item in value])
         if any(isinstance(item, _Run) for item in value):
             value[:] = _expanded(value)
-        if all(type(item) is int for item in value):
+        if all(type(item) is int and _INT64.min <= item <= _INT64.max for item in value):
             return np.array(value, np.int64)
     return value
 
