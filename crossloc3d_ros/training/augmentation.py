@@ -11,6 +11,8 @@ from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.types import Float32Array
 
+_HEADING_MARGIN = 1.25
+"""How far beyond half the step between two headings the weights learn to follow."""
 _THING_RADIUS_M = (1.0, 6.0)
 _THING_HEIGHT_M = (1.5, 12.0)
 _THING_POINTS = (20, 300)
@@ -31,6 +33,15 @@ def occlude(points: Float32Array, rng: np.random.Generator, config: TrainConfig)
         width = rng.uniform(0.0, math.pi / 2.0)
         kept &= np.mod(bearing - rng.uniform(0.0, 2.0 * math.pi), 2.0 * math.pi) >= width
     return points[kept]
+
+
+def heading_error(rng: np.random.Generator, config: TrainConfig) -> float:
+    """Return by how much a scan is turned away from its submap, radians.
+
+    One heading: anything, the weights learn not to mind it. Several: one of the turned queries is nearly right.
+    """
+    most = math.pi if config.headings == 1 else _HEADING_MARGIN * math.pi / config.headings
+    return float(rng.uniform(-most, most))
 
 
 def change(points: Float32Array, half_extent_m: float, rng: np.random.Generator, config: TrainConfig) -> Float32Array:

@@ -21,14 +21,12 @@ from crossloc3d_ros.evaluation.published import PatchSource, load_evaluation_set
 from crossloc3d_ros.evaluation.sets import PlaceSet
 from crossloc3d_ros.formats.cs_campus3d import INFO, CloudTable, Preset, TrainingTuples, preset_of, read_training
 from crossloc3d_ros.training.areas import TRAINING, VALIDATION, Roles, cut_areas
-from crossloc3d_ros.training.augmentation import occlude, paper_batch, paper_cloud
+from crossloc3d_ros.training.augmentation import heading_error, occlude, paper_batch, paper_cloud
 from crossloc3d_ros.training.sampling import Batch, HardPlaces
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 _ATTEMPTS = 60
-_HEADING_MARGIN = 1.25
-"""How far beyond half the step between two headings the weights learn to follow."""
 _HELD_OUT = 0.1
 """Share of the scans that is held out where the dataset has no validation area."""
 _CLOUD_REACH_M = 25.0
@@ -145,11 +143,9 @@ class PatchSampler:
                 continue
             quarter = int(rng.integers(4))
             submap = turn(submap, quarter * math.pi / 2.0)
-            # One heading: the weights learn not to mind it. Several: one of the turned queries is nearly right.
-            angle = float(rng.uniform(-math.pi, math.pi))
+            angle = heading_error(rng, config)
             if config.headings > 1:
-                angle = float(clouds.heading_rad[row]) + quarter * math.pi / 2.0
-                angle += float(rng.uniform(-1.0, 1.0)) * _HEADING_MARGIN * math.pi / config.headings
+                angle += float(clouds.heading_rad[row]) + quarter * math.pi / 2.0
             scan = turn(scan, angle)
             if rng.integers(2):
                 mirror = np.array([1.0, -1.0, 1.0], np.float32)

@@ -23,7 +23,7 @@ from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import MountingConfig, PlacesConfig, PreprocessingConfig, ScanConfig, to_dict
 from crossloc3d_ros.errors import ConfigError, TrainingError
 from crossloc3d_ros.simulation.families import FAMILIES, HELD_OUT_FAMILIES, TRAINING_FAMILIES
-from crossloc3d_ros.simulation.real_world import world_from_points
+from crossloc3d_ros.simulation.real_world import BUILDING, GROUND, WATER, world_from_points
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import Town, make_town
 from crossloc3d_ros.simulation.vlp16 import Vlp16
@@ -42,7 +42,7 @@ from crossloc3d_ros.training.shards import (
 )
 from crossloc3d_ros.types import Float32Array, Float64Array, Scan, UInt8Array
 
-UNCLASSIFIED, GROUND_CLASS, BUILDING_CLASS, WATER_CLASS = 1, 2, 6, 9
+_UNCLASSIFIED = 1
 _SEEDS_A_SET = 100_000
 _VALIDATION_SEEDS = 50_000
 _DIAGONAL = 2.0**0.5 + 0.01
@@ -190,9 +190,9 @@ def surveyed_world(town: Town, config: PlacesConfig) -> World:
     survey = fly(town, _flight(config), rng)
     classes = survey.classification
     if rng.random() < 0.5:
-        classes = np.where(classes == BUILDING_CLASS, np.uint8(UNCLASSIFIED), classes)
+        classes = np.where(classes == BUILDING, np.uint8(_UNCLASSIFIED), classes)
     # A water's few echoes would make ground of it.
-    dry = classes != WATER_CLASS
+    dry = classes != WATER
     return world_from_points(
         survey.points[dry], classes[dry], town.bounds, name=town.name, crs=town.crs, origin_grid=town.origin_grid,
         seed=town.seed, least_share=0.25,
@@ -214,7 +214,7 @@ def survey_above_ground(town: Town, config: PlacesConfig, rng: np.random.Generat
 
 def above_terrain(points: Float64Array, classes: UInt8Array, bounds: Bounds, cell_m: float) -> Float64Array:
     """Return points (N, 3) with the height above the terrain, made from those of class ground, for z."""
-    terrain = terrain_raster(points, classes == GROUND_CLASS, bounds, cell_m)
+    terrain = terrain_raster(points, classes == GROUND, bounds, cell_m)
     return np.column_stack([points[:, :2], points[:, 2] - terrain.sample(points[:, 0], points[:, 1])])
 
 

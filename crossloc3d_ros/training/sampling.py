@@ -13,7 +13,7 @@ from numba import njit
 from crossloc3d_ros.clouds.patch import make_patch, turn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.training.augmentation import change, occlude, paper_batch, paper_cloud
+from crossloc3d_ros.training.augmentation import change, heading_error, occlude, paper_batch, paper_cloud
 from crossloc3d_ros.training.shards import TrainingTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
@@ -21,8 +21,6 @@ _CELL_M = 10.0
 _ATTEMPTS = 60
 _HARD_GROUP = 4
 """Places of a batch that were taken for each other."""
-_HEADING_MARGIN = 1.25
-"""How far beyond half the step between two headings the weights learn to follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +211,7 @@ class BatchSampler:
             submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
             if scan is None or submap is None:
                 continue
-            # One heading: the weights learn not to mind it. Several: one of the turned queries is nearly right.
-            error = math.pi if config.headings == 1 else _HEADING_MARGIN * math.pi / config.headings
-            angle = float(town.scan_heading_rad[index]) - heading + float(rng.uniform(-error, error))
+            angle = float(town.scan_heading_rad[index]) - heading + heading_error(rng, config)
             scan_points = turn(scan.points, angle)
             if mirrored:
                 scan_points[:, 1] *= -1.0

@@ -12,6 +12,7 @@ from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import CalibrationConfig
 from crossloc3d_ros.evaluation.recall import chance_of_hit, wilson_share
 from crossloc3d_ros.localization.credibility import calibrate
+from crossloc3d_ros.localization.retrieval import heading_angles
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
@@ -138,8 +139,8 @@ def validate(
     submap_places = Places(_towns([len(t.submap_xy_m) for t in towns]), np.concatenate([t.submap_xy_m for t in towns]))
     patches = [patch for town in towns for patch in town.query_patches]
     submaps = encode([patch for town in towns for patch in town.submap_patches])
-    count = max(headings, turns)
-    encoded = [encode([turn(patch, 2.0 * math.pi * i / count) for patch in patches]) for i in range(count)]
+    angles = heading_angles(max(headings, turns))
+    encoded = [encode([turn(patch, float(angle)) for patch in patches]) for angle in angles]
     queries = encoded if headings > 1 else [np.mean(encoded, axis=0)]
     nearest = np.min([euclidean_distances(q, submaps) for q in queries], axis=0)
     return score(nearest, ground_distances(query_places, submap_places))
