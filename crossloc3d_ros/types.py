@@ -77,6 +77,69 @@ class Candidates:
         return len(self.submap_ids)
 
 
+@dataclass(frozen=True, eq=False)
+class AlignedPoses:
+    """Poses of the base at which a scan fits the aerial map, best first."""
+
+    grid: Float64Array
+    """(n, 3) easting, northing, height of base, metres, grid frame."""
+    heading_rad: Float64Array
+    """(n,) heading of base, counter-clockwise from grid east."""
+    covariance: Float64Array
+    """(n, 3, 3) of easting, northing, heading: m2, m rad, rad2; from the score's shape."""
+    log_likelihood: Float64Array
+    """(n,) natural logarithm of how much likelier the scan is here than at a place that the map does not hold."""
+    probabilities: Float64Array
+    """(n,) share of belief from this scan alone; what is missing to 1 is the belief in none of them."""
+    inliers: Float64Array
+    """(n,) share of the scan's returns that the map explains at this pose."""
+    converged: BoolArray
+    """(n,) whether the refinement came to rest inside of the area searched."""
+    source: Int64Array
+    """(n,) which candidate the search began at: its row among the candidates; -1 - h for hypothesis h, and
+    `EXHAUSTIVE` where the whole map was searched."""
+    log_prior: float = 0.0
+    """Natural logarithm of the odds, before the scan, that the robot is at a given one of the places of the map rather
+    than off it: `probabilities` is the softmax of `log_likelihood + log_prior` beside a 0 for none of them."""
+
+    def __len__(self) -> int:
+        return len(self.log_likelihood)
+
+
+EXHAUSTIVE = -(2**31)
+"""`AlignedPoses.source` of a pose found by a search of the whole map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Poses that the robot may have, carried along by odometry, likeliest first."""
+
+    grid: Float64Array
+    """(h, 3) easting, northing, height of base, metres, grid frame."""
+    heading_rad: Float64Array
+    """(h,) counter-clockwise from grid east."""
+    covariance: Float64Array
+    """(h, 3, 3) of easting, northing, heading: m2, m rad, rad2."""
+    probabilities: Float64Array
+    """(h,) what is missing to 1 is the belief in none of them."""
+
+    def __len__(self) -> int:
+        return len(self.probabilities)
+
+
+class TrackState(Enum):
+    """How far the robot knows where it is."""
+
+    SEARCHING = "searching"
+    """Nothing is believed yet."""
+    AMBIGUOUS = "ambiguous"
+    """Several places are believed."""
+    LOCALIZED = "localized"
+    """One place is believed, by more than the threshold."""
+    LOST = "lost"
+    """It was localized, and what it sees no longer fits."""
+
+
 class FixStatus(Enum):
     """Whether an estimate may be driven by."""
 
@@ -91,10 +154,12 @@ class Timings:
     prepare_ms: float = 0.0
     encode_ms: float = 0.0
     search_ms: float = 0.0
+    align_ms: float = 0.0
+    fuse_ms: float = 0.0
 
     @property
     def total_ms(self) -> float:
-        return self.prepare_ms + self.encode_ms + self.search_ms
+        return self.prepare_ms + self.encode_ms + self.search_ms + self.align_ms + self.fuse_ms
 
 
 @dataclass(frozen=True)
@@ -130,6 +195,28 @@ class Estimate:
     candidates: Candidates
     counts: ScanCounts = field(default_factory=ScanCounts)
     timings: Timings = field(default_factory=Timings)
+    state: TrackState = TrackState.SEARCHING
+    probability: float = float("nan")
+    """That the horizontal error is below 10 m."""
+    T_map_base: Float64Array = field(default_factory=lambda: np.full((4, 4), np.nan))
+    """(4, 4) the base in the frame map; NaN where no pose is known."""
+    pose_covariance: Float64Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    """(6, 6) of x, y, z, and rotations about x, y, z of the frame map: m2, m rad, rad2; NaN where unknown."""
+    aligned: AlignedPoses = field(default_factory=lambda: no_aligned_poses())
+    hypotheses: Hypotheses = field(default_factory=lambda: no_hypotheses())
+
+
+def no_aligned_poses() -> AlignedPoses:
+    """Return the poses of a scan that fits nowhere, or that was not aligned."""
+    none = np.empty(0)
+    return AlignedPoses(
+        np.empty((0, 3)), none, np.empty((0, 3, 3)), none, none, none, np.empty(0, np.bool_), np.empty(0, np.int64)
+    )
+
+
+def no_hypotheses() -> Hypotheses:
+    """Return the hypotheses of a robot that has seen nothing."""
+    return Hypotheses(np.empty((0, 3)), np.empty(0), np.empty((0, 3, 3)), np.empty(0))
 
 
 class DescriptorEncoder(Protocol):
