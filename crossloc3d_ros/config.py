@@ -138,6 +138,17 @@ class LocalizerNodeConfig(LocalizerConfig):
     mounting_from_tf: bool = option(False, "take the lidar's pose on base_frame_id from TF, not from scan.mounting")
     use_imu: bool = option(False, "level the scan by the accelerations on topic imu (axes of base_frame_id)")
     imu_time_constant_s: float = option(1.0, "time constant of the low-pass on the accelerations", low=0.01, high=60.0)
+    use_imu_heading: bool = option(False, "take the orientation on topic imu as a first guess of the heading")
+    imu_heading_std_deg: float = option(15.0, "one sigma of that heading", low=1.0, high=180.0)
+    imu_heading_offset_deg: float = option(
+        0.0, "added to it, counter-clockwise: minus the magnetic declination, a mounting", low=-360.0, high=360.0
+    )
+    odometry: Literal["topic", "scan", "none"] = option(
+        "topic", "how the robot has moved: told on topic odom, from scan to scan (the extra 'odometry'), or unknown"
+    )
+    odometry_wait_s: float = option(0.05, "how long a scan waits for the odometry of its stamp", low=0.0, high=1.0)
+    publish_tf: bool = option(False, "publish global_frame_id -> odometry frame on /tf while localized (REP-105)")
+    tf_tolerance_s: float = option(0.2, "how far ahead of its scan that transform is stamped", low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,10 @@ class CloudError(CrossLocError):
     """A point cloud or point-cloud message cannot be used as it is."""
 
 
+class PoseError(CrossLocError):
+    """A message that tells a pose, such as odometry or an initial pose, cannot be used as it is."""
+
+
 class AerialDataError(CrossLocError):
     """An aerial file is unreadable, has no usable CRS, or disagrees with the others of the build."""
 

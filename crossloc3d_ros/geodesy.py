@@ -289,6 +289,14 @@ class MapFrame:
         easting, northing = _transformer(_WGS84_3D, self.crs).transform(longitude, latitude)
         return np.column_stack([easting, northing, height - (self.geoid_separation_m or 0.0)])
 
+    @property
+    def T_earth_map(self) -> Float64Array:
+        """Return the pose (4, 4) of the tangent frame in `earth`, which is ECEF (REP-105), metres."""
+        origin_ecef, R_enu_ecef = self._tangent
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R_enu_ecef.T, origin_ecef
+        return T
+
     def convergence_rad(self, grid: Float64Array) -> Float64Array:
         """Return the angle (N,) from true north to grid north at grid points (N, 3), clockwise positive.
 

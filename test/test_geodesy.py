@@ -77,6 +77,17 @@ def test_enu_agrees_with_projs_topocentric_frame(offset: tuple[float, float, flo
     np.testing.assert_allclose(AMSTERDAM.to_enu(grid)[0], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("frame", [AMSTERDAM, SYDNEY])
+def test_the_pose_of_the_map_on_earth_takes_its_points_to_ecef(frame: MapFrame) -> None:
+    grid = frame.origin + np.array([[0.0, 0.0, 0.0], [4_000.0, -700.0, 25.0]])
+    separation = frame.geoid_separation_m or 0.0
+    longitude, latitude = pyproj.Transformer.from_crs(frame.crs, 4979, always_xy=True).transform(*grid[:, :2].T)
+    to_ecef = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    expected = np.stack(to_ecef.transform(longitude, latitude, grid[:, 2] + separation), axis=-1)
+    T = frame.T_earth_map
+    np.testing.assert_allclose(frame.to_enu(grid) @ T[:3, :3].T + T[:3, 3], expected, atol=1e-6)
+
+
 def test_enu_is_metric_where_the_grid_is_not() -> None:
     grid = np.array([[166_021.0, 0.0, 0.0], [167_021.0, 0.0, 0.0]])  # the edge of a zone at the equator
     frame = MapFrame("EPSG:32631", grid[0], 0.0)
