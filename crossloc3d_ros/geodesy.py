@@ -290,8 +290,8 @@ class MapFrame:
         return np.column_stack([easting, northing, height - (self.geoid_separation_m or 0.0)])
 
     @property
-    def T_earth_map(self) -> Float64Array:
-        """Return the pose (4, 4) of the tangent frame in `earth`, which is ECEF (REP-105), metres."""
+    def pose_on_earth(self) -> Float64Array:
+        """Return `T_earth_map` (4, 4): the tangent frame in `earth`, which is ECEF (REP-105), metres."""
         origin_ecef, R_enu_ecef = self._tangent
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R_enu_ecef.T, origin_ecef

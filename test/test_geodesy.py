@@ -84,7 +84,7 @@ def test_the_pose_of_the_map_on_earth_takes_its_points_to_ecef(frame: MapFrame) 
     longitude, latitude = pyproj.Transformer.from_crs(frame.crs, 4979, always_xy=True).transform(*grid[:, :2].T)
     to_ecef = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
     expected = np.stack(to_ecef.transform(longitude, latitude, grid[:, 2] + separation), axis=-1)
-    T = frame.T_earth_map
+    T = frame.pose_on_earth
     np.testing.assert_allclose(frame.to_enu(grid) @ T[:3, :3].T + T[:3, 3], expected, atol=1e-6)
 
 
