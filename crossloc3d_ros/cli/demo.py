@@ -233,7 +233,7 @@ def beside_the_truth(table: EstimateTable, frame: MapFrame) -> Table:
             f"{errors[i]:.0f} m" if fixed and np.isfinite(errors[i]) else "–",
             f"{first:.0f} m" if np.isfinite(first) else "–",
             f"{belief:.0%}" if np.isfinite(belief) else "–",
-            f"{table.timings_ms[i, 3]:.0f} ms" if np.isfinite(table.timings_ms[i, 3]) else "–",
+            f"{table.latency_ms[i]:.0f} ms" if np.isfinite(table.latency_ms[i]) else "–",
         )
     return result
 

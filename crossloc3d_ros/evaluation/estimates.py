@@ -1,6 +1,9 @@
 """Estimates on disk: written while they are made, read back to be scored, so that figures can be checked later.
 
-One CSV row a scan. Lists inside a row (the candidates, best first) are separated by spaces; unknown numbers are empty.
+One CSV row a scan. Lists inside a row (candidates, aligned poses, hypotheses, best first) are separated by spaces;
+unknown numbers are empty. `heading_deg` and its truth are counter-clockwise from true east, as in the frame `map`; the
+`grid_headings_deg` of the lists are counter-clockwise from grid east, the axis of their eastings. Files from before
+there were poses lack columns, and are read all the same.
 """
 
 from __future__ import annotations
@@ -19,10 +22,38 @@ import numpy as np
 
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.types import BoolArray, Estimate, FixStatus, Float64Array, Int64Array
+from crossloc3d_ros.types import (
+    AlignedPoses,
+    BoolArray,
+    Estimate,
+    FixStatus,
+    Float64Array,
+    Hypotheses,
+    Int64Array,
+    TrackState,
+)
 
 _COVARIANCE_COLUMNS = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
-_TIMING_COLUMNS = ("prepare_ms", "encode_ms", "search_ms", "latency_ms")
+_TIMING_COLUMNS = ("prepare_ms", "encode_ms", "search_ms", "align_ms", "fuse_ms", "latency_ms")
+_POSE_COLUMNS = ("state", "probability", "heading_deg", "heading_std_deg")
+_LIST_COLUMNS = (
+    "eastings_m",
+    "northings_m",
+    "grid_headings_deg",
+    "cov_ee_m2",
+    "cov_en_m2",
+    "cov_nn_m2",
+    "heading_stds_deg",
+    "probabilities",
+)
+_ALIGNED, _HYPOTHESIS = "aligned_", "hypothesis_"
+_ALIGNED_COLUMNS = (
+    "aligned_sources",
+    "aligned_log_likelihoods",
+    "aligned_inliers",
+    *(_ALIGNED + name for name in _LIST_COLUMNS),
+)
+_HYPOTHESIS_COLUMNS = tuple(_HYPOTHESIS + name for name in _LIST_COLUMNS)
 _CANDIDATE_COLUMNS = (
     "candidate_ids",
     "candidate_distances",
@@ -40,13 +71,50 @@ _ESTIMATE_COLUMNS = (
     "northing_m",
     "height_m",
     *_COVARIANCE_COLUMNS,
+    *_POSE_COLUMNS,
     "points_received",
     "points_in_patch",
     *_TIMING_COLUMNS,
     *_CANDIDATE_COLUMNS,
+    *_ALIGNED_COLUMNS,
+    *_HYPOTHESIS_COLUMNS,
     "reason",
 )
-_TRUTH_COLUMNS = ("truth_latitude_deg", "truth_longitude_deg", "truth_easting_m", "truth_northing_m", "error_m")
+_TRUTH_COLUMNS = (
+    "truth_latitude_deg",
+    "truth_longitude_deg",
+    "truth_easting_m",
+    "truth_northing_m",
+    "error_m",
+    "truth_heading_deg",
+    "heading_error_deg",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseLists:
+    """Several poses for each of S scans, likeliest first: up to K, the rest NaN."""
+
+    grid: Float64Array
+    """(S, K, 2) easting and northing, metres."""
+    heading_rad: Float64Array
+    """(S, K) counter-clockwise from grid east."""
+    covariance: Float64Array
+    """(S, K, 2, 2) of easting and northing, m2."""
+    heading_std_rad: Float64Array
+    """(S, K)"""
+    probabilities: Float64Array
+    """(S, K)"""
+
+    def count(self, scan: int) -> int:
+        """Return how many poses the scan has."""
+        return int(np.isfinite(self.grid[scan, :, 0]).sum())
+
+
+def no_pose_lists(scans: int) -> PoseLists:
+    """Return the lists of scans that have no poses."""
+    none = np.empty((scans, 0))
+    return PoseLists(np.empty((scans, 0, 2)), none, np.empty((scans, 0, 2, 2)), none, none)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +132,8 @@ class EstimateTable:
     covariance: Float64Array
     """(S, 3, 3) ENU, square metres."""
     timings_ms: Float64Array
-    """(S, 4) preparing, encoding, searching, and from scan to estimate altogether; NaN where not measured."""
+    """(S, 6) preparing, encoding, searching, aligning, fusing, and last from scan to estimate altogether; NaN where not
+    measured."""
     points: Int64Array
     """(S, 2) points received and points used; -1 where not known."""
     candidate_ids: Int64Array
@@ -77,6 +146,18 @@ class EstimateTable:
     """(S, K, 2) easting and northing, metres; NaN where there are fewer."""
     truth_grid: Float64Array
     """(S, 2) easting and northing, metres; NaN where unknown."""
+    truth_heading_rad: Float64Array
+    """(S,) counter-clockwise from true east; NaN where unknown."""
+    states: tuple[TrackState | None, ...]
+    """(S,); None where the file does not say."""
+    probability: Float64Array
+    """(S,) belief that the horizontal error is below 10 m; NaN where the file does not say."""
+    heading_rad: Float64Array
+    """(S,) of base, counter-clockwise from true east, as in the frame map; NaN where unknown."""
+    heading_std_rad: Float64Array
+    """(S,)"""
+    aligned: PoseLists
+    hypotheses: PoseLists
     reasons: tuple[str, ...]
     """(S,)"""
 
@@ -87,6 +168,21 @@ class EstimateTable:
     def error_m(self) -> Float64Array:
         """Horizontal distance (S,) from the estimate to the truth, NaN where either is unknown."""
         return np.asarray(np.hypot(*(self.grid[:, :2] - self.truth_grid).T))
+
+    @property
+    def heading_error_rad(self) -> Float64Array:
+        """Signed heading error (S,) in [-pi, pi], NaN where either is unknown."""
+        return wrapped(self.heading_rad - self.truth_heading_rad)
+
+    @property
+    def latency_ms(self) -> Float64Array:
+        """From scan to estimate altogether (S,), NaN where not measured."""
+        return np.asarray(self.timings_ms[:, -1])
+
+    @property
+    def has_track(self) -> bool:
+        """Whether the file knows of poses followed over time, and not of places alone."""
+        return bool(np.isfinite(self.probability).any() or np.isfinite(self.heading_rad).any())
 
 
 class EstimateWriter:
@@ -116,8 +212,8 @@ class EstimateWriter:
         candidates = estimate.candidates
         covariance = estimate.covariance[np.triu_indices(3)]
         timings = estimate.timings
-        parts = (timings.prepare_ms, timings.encode_ms, timings.search_ms)
-        measured = parts if timings.total_ms > 0 else (math.nan,) * 3
+        parts = (timings.prepare_ms, timings.encode_ms, timings.search_ms, timings.align_ms, timings.fuse_ms)
+        measured = parts if timings.total_ms > 0 else (math.nan,) * len(parts)
         latency = timings.total_ms if latency_ms is None else latency_ms
         row: list[str] = [
             str(estimate.stamp_ns),
@@ -126,7 +222,11 @@ class EstimateWriter:
             _number(estimate.longitude_deg, 9),
             _number(estimate.altitude_m, 3),
             *(_number(value, 3) for value in estimate.grid),
-            *(_number(value, 3) for value in covariance),
+            *(_number(value, 4) for value in covariance),
+            estimate.state.value,
+            _number(estimate.probability, 6),
+            _number(math.degrees(heading_of(estimate.T_map_base)), 4),
+            _number(math.degrees(_std(estimate.pose_covariance[5, 5])), 4),
             str(estimate.counts.received),
             str(estimate.counts.in_patch),
             *(_number(value, 3) for value in measured),
@@ -136,6 +236,11 @@ class EstimateWriter:
             " ".join(f"{value:.6g}" for value in candidates.probabilities),
             " ".join(f"{value:.2f}" for value in candidates.grid[:, 0]),
             " ".join(f"{value:.2f}" for value in candidates.grid[:, 1]),
+            " ".join(str(int(source)) for source in estimate.aligned.source),
+            _list(estimate.aligned.log_likelihood, ".3f"),
+            _list(estimate.aligned.inliers, ".3f"),
+            *_pose_list(estimate.aligned),
+            *_pose_list(estimate.hypotheses),
             estimate.reason,
         ]
         try:
@@ -157,12 +262,16 @@ def read_estimates(path: Path) -> EstimateTable:
         raise CrossLocError(f"{path} is not a file of estimates: {error!r}") from error
 
 
-def add_truth(path: Path, truth_grid: Float64Array, frame: MapFrame) -> EstimateTable:
+def add_truth(
+    path: Path, truth_grid: Float64Array, frame: MapFrame, truth_heading_rad: Float64Array | None = None
+) -> EstimateTable:
     """Add the columns of truth and error to a file of estimates and return its table.
 
-    `truth_grid` (S, 2 or 3) easting and northing of each row, NaN where unknown. The file is replaced as a whole.
+    `truth_grid` (S, 2 or 3) easting and northing of each row, `truth_heading_rad` (S,) counter-clockwise from true
+    east; NaN where unknown. The file is replaced as a whole.
     """
     table = read_estimates(path)
+    headings = np.full(len(table), np.nan) if truth_heading_rad is None else truth_heading_rad
     if len(truth_grid) != len(table):
         raise CrossLocError(f"truth for {len(truth_grid)} scans does not fit the {len(table)} estimates of {path}")
     places = np.column_stack([truth_grid[:, :2], np.zeros(len(truth_grid))])
@@ -171,6 +280,7 @@ def add_truth(path: Path, truth_grid: Float64Array, frame: MapFrame) -> Estimate
     if known.any():
         latitude[known], longitude[known], _ = frame.to_geographic(places[known])
     errors = np.hypot(*(table.grid[:, :2] - truth_grid[:, :2]).T)
+    heading_errors = wrapped(table.heading_rad - headings)
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     text = io.StringIO()
@@ -183,6 +293,8 @@ def add_truth(path: Path, truth_grid: Float64Array, frame: MapFrame) -> Estimate
             _number(truth_grid[i, 0], 3),
             _number(truth_grid[i, 1], 3),
             _number(errors[i], 3),
+            _number(math.degrees(headings[i]), 4),
+            _number(math.degrees(heading_errors[i]), 4),
         )
         writer.writerow({**row, **dict(zip(_TRUTH_COLUMNS, values, strict=True))})
     write_atomically(path, text.getvalue())
@@ -215,9 +327,10 @@ def write_geojson(path: Path, table: EstimateTable, frame: MapFrame, candidates:
                     "kind": "fix" if table.has_fix[i] else "no fix",
                     "scan": i,
                     "stamp_ns": str(table.stamp_ns[i]),  # as text: nanoseconds do not fit JSON's double
-                    "error_m": _json_number(errors[i], 1),
-                    "std_east_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 0, 0])), 1),
-                    "std_north_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 1, 1])), 1),
+                    "error_m": _json_number(errors[i], 2),
+                    "std_east_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 0, 0])), 2),
+                    "std_north_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 1, 1])), 2),
+                    **_pose_properties(table, i),
                     "reason": table.reasons[i],
                 },
             }
@@ -245,7 +358,32 @@ def write_geojson(path: Path, table: EstimateTable, frame: MapFrame, candidates:
                     },
                 }
             )
+        held = table.hypotheses.grid[i, : min(table.hypotheses.count(i), candidates)]
+        if len(held):
+            features.append(
+                {
+                    "type": "Feature",
+                    "geometry": {"type": "MultiPoint", "coordinates": [_position(p) for p in _geographic(frame, held)]},
+                    "properties": {
+                        "kind": "hypotheses",
+                        "scan": i,
+                        "probabilities": [
+                            _json_number(value, 4) for value in table.hypotheses.probabilities[i, : len(held)]
+                        ],
+                    },
+                }
+            )
     write_atomically(path, json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False))
+
+
+def wrapped(angle_rad: Float64Array) -> Float64Array:
+    """Return angles as the same angles in [-pi, pi]."""
+    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
+
+
+def heading_of(T_map_base: Float64Array) -> float:
+    """Return the heading of a pose (4, 4), counter-clockwise from the x axis of its frame, radians; NaN of none."""
+    return math.atan2(T_map_base[1, 0], T_map_base[0, 0])
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -288,6 +426,13 @@ def _table(rows: Sequence[dict[str, str]]) -> EstimateTable:
         candidate_probabilities=lists["candidate_probabilities"],
         candidate_grid=np.stack([lists["candidate_eastings_m"], lists["candidate_northings_m"]], axis=-1),
         truth_grid=_columns(rows, ("truth_easting_m", "truth_northing_m")),
+        truth_heading_rad=np.radians(_columns(rows, ("truth_heading_deg",))[:, 0]),
+        states=tuple(TrackState(row["state"]) if row.get("state") else None for row in rows),
+        probability=_columns(rows, ("probability",))[:, 0],
+        heading_rad=np.radians(_columns(rows, ("heading_deg",))[:, 0]),
+        heading_std_rad=np.radians(_columns(rows, ("heading_std_deg",))[:, 0]),
+        aligned=_pose_lists(rows, _ALIGNED),
+        hypotheses=_pose_lists(rows, _HYPOTHESIS),
         reasons=tuple(row["reason"] for row in rows),
     )
 
@@ -295,6 +440,61 @@ def _table(rows: Sequence[dict[str, str]]) -> EstimateTable:
 def _columns(rows: Sequence[dict[str, str]], names: Sequence[str]) -> Float64Array:
     values = [[float(row.get(name) or "nan") for name in names] for row in rows]
     return np.array(values, dtype=np.float64).reshape(len(rows), len(names))
+
+
+def _pose_list(poses: AlignedPoses | Hypotheses) -> tuple[str, ...]:
+    """Return the columns `_LIST_COLUMNS` of poses."""
+    covariance = poses.covariance
+    stds = np.sqrt(np.maximum(covariance[:, 2, 2], 0.0))
+    return (
+        _list(poses.grid[:, 0], ".2f"),
+        _list(poses.grid[:, 1], ".2f"),
+        _list(np.degrees(poses.heading_rad), ".2f"),
+        _list(covariance[:, 0, 0], ".4g"),
+        _list(covariance[:, 0, 1], ".4g"),
+        _list(covariance[:, 1, 1], ".4g"),
+        _list(np.degrees(stds), ".3g"),
+        _list(poses.probabilities, ".6g"),
+    )
+
+
+def _list(values: Float64Array, form: str) -> str:
+    return " ".join(format(float(value), form) for value in values)
+
+
+def _pose_lists(rows: Sequence[dict[str, str]], prefix: str) -> PoseLists:
+    """Return the lists whose columns begin with `prefix`; empty ones where the file has none."""
+    texts = [[(row.get(prefix + name) or "").split() for name in _LIST_COLUMNS] for row in rows]
+    width = max((len(lists[0]) for lists in texts), default=0)
+    values = np.full((len(_LIST_COLUMNS), len(rows), width), np.nan)
+    for i, lists in enumerate(texts):
+        for column, found in enumerate(lists):
+            values[column, i, : len(lists[0])] = [float(value) for value in found]
+    east, north, heading_deg, ee, en, nn, std_deg, probabilities = values
+    return PoseLists(
+        grid=np.stack([east, north], axis=-1),
+        heading_rad=np.radians(heading_deg),
+        covariance=np.stack([np.stack([ee, en], axis=-1), np.stack([en, nn], axis=-1)], axis=-1),
+        heading_std_rad=np.radians(std_deg),
+        probabilities=probabilities,
+    )
+
+
+def _pose_properties(table: EstimateTable, scan: int) -> dict[str, Any]:
+    """Return what GeoJSON says of a pose; nothing where the file knows of places alone."""
+    state = table.states[scan]
+    if state is None:
+        return {}
+    return {
+        "state": state.value,
+        "probability": _json_number(table.probability[scan], 4),
+        "heading_deg": _json_number(math.degrees(table.heading_rad[scan]), 2),
+        "heading_std_deg": _json_number(math.degrees(table.heading_std_rad[scan]), 2),
+    }
+
+
+def _std(variance: float) -> float:
+    return math.sqrt(variance) if variance >= 0.0 else math.nan
 
 
 def _number(value: float, digits: int) -> str:

@@ -151,7 +151,7 @@ def write_summary(folder: Path, evaluation: Evaluation, about: dict[str, Any]) -
 
 def latency_summary(table: EstimateTable) -> dict[str, float]:
     """Return median, 95 % and maximum of the time from scan to estimate, milliseconds."""
-    latency = table.timings_ms[:, 3]
+    latency = table.latency_ms
     latency = latency[np.isfinite(latency)]
     if not len(latency):
         return {}

@@ -129,7 +129,7 @@ def _tiles(table: EstimateTable, scores: Scores | None) -> str:
         for rank, name in ((1, "Right place first"), (5, "Among the first five")):
             cell = scores.recall(rank, 50.0)
             tiles.append((name, _percent(cell.share.value), f"within 50 m; by lot {_percent(cell.chance)}"))
-    latency = table.timings_ms[:, 3]
+    latency = table.latency_ms
     latency = latency[np.isfinite(latency)]
     if len(latency):
         detail = f"median; 95 % within {np.percentile(latency, 95):.0f} ms"
@@ -381,7 +381,7 @@ def _cdf_chart(table: EstimateTable, scores: Scores | None, submaps: Float64Arra
 
 
 def _latency_chart(table: EstimateTable, about: About) -> str:
-    latency = table.timings_ms[:, 3]
+    latency = table.latency_ms
     latency = latency[np.isfinite(latency)]
     if not len(latency):
         return "<p>Not measured.</p>"
@@ -423,7 +423,7 @@ def _candidate_errors(table: EstimateTable) -> Float64Array:
 def _data(table: EstimateTable, backdrop: Backdrop, chosen: list[int]) -> str:
     seconds = _seconds(table)
     truth, fixes = _to_view(table.truth_grid, backdrop), _to_view(table.grid[:, :2], backdrop)
-    errors, latency = table.error_m, table.timings_ms[:, 3]
+    errors, latency = table.error_m, table.latency_ms
     reasons: dict[str, int] = {}
     scans: list[dict[str, Any]] = []
     for i in chosen:

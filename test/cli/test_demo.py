@@ -12,7 +12,7 @@ from rich.console import Console
 
 from crossloc3d_ros.cli import demo
 from crossloc3d_ros.errors import MapError
-from crossloc3d_ros.evaluation.estimates import EstimateTable
+from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
 from crossloc3d_ros.geodesy import MapFrame
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -89,13 +89,20 @@ def test_fixes_stand_beside_the_truth() -> None:
         geographic=np.column_stack([latitude, longitude, altitude]),
         grid=grid,
         covariance=np.zeros((count, 3, 3)),
-        timings_ms=np.full((count, 4), 21.0),
+        timings_ms=np.full((count, 6), 21.0),
         points=np.zeros((count, 2), dtype=np.int64),
         candidate_ids=np.zeros((count, 1), dtype=np.int64),
         candidate_distances=np.zeros((count, 1)),
         candidate_probabilities=np.full((count, 1), 0.75),
         candidate_grid=truth[:, None] + np.array([0.0, 12.0]),
         truth_grid=truth,
+        truth_heading_rad=np.zeros(count),
+        states=(None,) * count,
+        probability=np.full(count, np.nan),
+        heading_rad=np.full(count, np.nan),
+        heading_std_rad=np.full(count, np.nan),
+        aligned=no_pose_lists(count),
+        hypotheses=no_pose_lists(count),
         reasons=("",) * count,
     )
     said = io.StringIO()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,16 @@ import pytest
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation import estimates
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.types import Candidates, Estimate, FixStatus, ScanCounts, Timings
+from crossloc3d_ros.types import (
+    AlignedPoses,
+    Candidates,
+    Estimate,
+    FixStatus,
+    Hypotheses,
+    ScanCounts,
+    Timings,
+    TrackState,
+)
 
 FRAME = MapFrame("EPSG:32631", np.array([628_700.0, 5_803_600.0, 2.0]), 43.0)
 STAMP = 1_700_000_000_123_456_789
@@ -45,6 +55,46 @@ def estimate(seed: int, candidates: int = 3, status: FixStatus = FixStatus.FIX, 
     )
 
 
+def covariances(rng: np.random.Generator, count: int) -> np.ndarray:
+    root = rng.normal(size=(count, 3, 3)) * [1.0, 1.0, 0.05]
+    return np.swapaxes(root, 1, 2) @ root
+
+
+def posed(seed: int, aligned: int = 4, hypotheses: int = 2, heading_rad: float = 0.3) -> Estimate:
+    """Return an estimate that knows its pose."""
+    rng = np.random.default_rng([seed, 1])
+    place = np.array([628_700.0, 5_803_600.0, 3.0])
+    T_map_base = np.eye(4)
+    T_map_base[:2, :2] = [
+        [np.cos(heading_rad), -np.sin(heading_rad)],
+        [np.sin(heading_rad), np.cos(heading_rad)],
+    ]
+    return replace(
+        estimate(seed),
+        timings=Timings(5.25, 11.5, 0.25, 40.0, 2.0),
+        state=TrackState.LOCALIZED,
+        probability=0.99925,
+        T_map_base=T_map_base,
+        pose_covariance=np.diag([0.04, 0.09, 1.0, 1e-3, 1e-3, 0.0004]),
+        aligned=AlignedPoses(
+            place + rng.normal(0, 50, (aligned, 3)),
+            rng.uniform(-np.pi, np.pi, aligned),
+            covariances(rng, aligned),
+            np.sort(rng.normal(0, 9, aligned))[::-1],
+            rng.dirichlet(np.ones(aligned)) if aligned else np.empty(0),
+            rng.uniform(size=aligned),
+            rng.uniform(size=aligned) < 0.5,
+            np.where(np.arange(aligned) % 2, -1, np.arange(aligned)),
+        ),
+        hypotheses=Hypotheses(
+            place + rng.normal(0, 50, (hypotheses, 3)),
+            rng.uniform(-np.pi, np.pi, hypotheses),
+            covariances(rng, hypotheses),
+            rng.dirichlet(np.ones(hypotheses)) if hypotheses else np.empty(0),
+        ),
+    )
+
+
 AWKWARD = 'a "quoted", comma\nand a line; ünïcode </script> '
 
 
@@ -66,7 +116,9 @@ def test_what_was_written_is_read_again(tmp_path: Path) -> None:
     assert table.has_fix.tolist() == [True, False, False]
     assert table.reasons == tuple(row.reason for row in rows)
     assert table.candidate_ids.shape == (3, 25)
-    assert table.timings_ms[0].tolist() == [5.25, 11.5, 0.25, 17.0]
+    assert table.timings_ms[0].tolist() == [5.25, 11.5, 0.25, 0.0, 0.0, 17.0]
+    assert table.latency_ms[0] == 17.0
+    assert not table.has_track
     assert table.points[0].tolist() == [28_800, 4096]
     for i, row in enumerate(rows):
         k = len(row.candidates)
@@ -80,6 +132,65 @@ def test_what_was_written_is_read_again(tmp_path: Path) -> None:
         np.testing.assert_allclose(table.grid[i], row.grid, atol=1e-3)
         np.testing.assert_allclose(table.geographic[i, :2], [row.latitude_deg, row.longitude_deg], atol=1e-8)
     assert np.isnan(table.truth_grid).all()
+
+
+def test_poses_are_read_again(tmp_path: Path) -> None:
+    rows = [posed(0), posed(1, aligned=0, hypotheses=5, heading_rad=-3.1), estimate(2, candidates=0)]
+    table = estimates.read_estimates(write(tmp_path / "e.csv", rows))
+    assert table.has_track
+    assert table.states == (TrackState.LOCALIZED, TrackState.LOCALIZED, TrackState.SEARCHING)
+    np.testing.assert_allclose(table.probability, [0.99925, 0.99925, np.nan])
+    np.testing.assert_allclose(table.heading_rad, [0.3, -3.1, np.nan], atol=2e-6)
+    np.testing.assert_allclose(table.heading_std_rad[:2], 0.02, rtol=1e-4)
+    assert table.timings_ms[0].tolist() == [5.25, 11.5, 0.25, 40.0, 2.0, 59.0]
+    for lists, name in ((table.aligned, "aligned"), (table.hypotheses, "hypotheses")):
+        for i, row in enumerate(rows):
+            poses = getattr(row, name)
+            n = len(poses)
+            assert lists.count(i) == n
+            np.testing.assert_allclose(lists.grid[i, :n], poses.grid[:, :2], atol=0.006)
+            np.testing.assert_allclose(lists.heading_rad[i, :n], poses.heading_rad, atol=1e-4)
+            np.testing.assert_allclose(lists.covariance[i, :n], poses.covariance[:, :2, :2], rtol=1e-3)
+            np.testing.assert_allclose(lists.heading_std_rad[i, :n], np.sqrt(poses.covariance[:, 2, 2]), rtol=6e-3)
+            np.testing.assert_allclose(lists.probabilities[i, :n], poses.probabilities, rtol=1e-5)
+            assert np.isnan(lists.grid[i, n:]).all()
+    first = next(csv.DictReader((tmp_path / "e.csv").open(newline="")))
+    assert [int(source) for source in first["aligned_sources"].split()] == [0, -1, 2, -1]
+
+
+def test_files_from_before_there_were_poses_are_read_and_scored(tmp_path: Path) -> None:
+    """The columns as the first release wrote them."""
+    path = write(tmp_path / "e.csv", [estimate(0), estimate(1, candidates=0, status=FixStatus.NO_FIX)])
+    new = ("state", "probability", "heading_", "align_ms", "fuse_ms", "aligned_", "hypothesis_")
+    rows = [{k: v for k, v in row.items() if not k.startswith(new)} for row in csv.DictReader(path.open(newline=""))]
+    assert len(rows[0]) == 26
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    truth = np.array([[628_700.0, 5_803_600.0], [628_701.0, 5_803_600.0]])
+    for table in (estimates.read_estimates(path), estimates.add_truth(path, truth, FRAME, np.array([0.1, 0.2]))):
+        assert len(table) == 2
+        assert not table.has_track
+        assert table.states == (None, None)
+        assert np.isnan(table.probability).all()
+        assert table.aligned.grid.shape == table.hypotheses.grid.shape == (2, 0, 2)
+        assert table.latency_ms[0] == 17.0
+        assert np.isnan(table.timings_ms[0, 3])
+    np.testing.assert_allclose(table.truth_heading_rad, [0.1, 0.2], atol=2e-6)
+    assert np.isfinite(table.error_m[0])
+    assert np.isnan(table.heading_error_rad).all()
+
+
+def test_heading_errors_go_the_short_way_round(tmp_path: Path) -> None:
+    rows = [posed(0, heading_rad=3.1), posed(1, heading_rad=-3.0), posed(2, heading_rad=0.5), posed(3)]
+    path = write(tmp_path / "e.csv", rows)
+    truth = np.array([row.grid[:2] for row in rows])
+    table = estimates.add_truth(path, truth, FRAME, np.array([-3.1, 3.0, 0.25, np.nan]))
+    expected = np.array([6.2 - 2 * np.pi, 2 * np.pi - 6.0, 0.25, np.nan])
+    np.testing.assert_allclose(table.heading_error_rad, expected, atol=1e-5)
+    written = [float(r["heading_error_deg"] or "nan") for r in csv.DictReader(path.open(newline=""))]
+    np.testing.assert_allclose(written, np.degrees(expected), atol=1e-3)
 
 
 def test_a_run_that_is_cut_short_leaves_whole_rows(tmp_path: Path) -> None:
@@ -148,7 +259,7 @@ def assert_is_rfc_7946(document: dict) -> None:
     ids=["all", "none", "gap", "alone", "mixed"],
 )
 def test_geojson_is_rfc_7946(tmp_path: Path, known: list[int]) -> None:
-    rows = [estimate(i, candidates=0 if i == 2 else 25, reason=AWKWARD) for i in range(6)]
+    rows = [estimate(i, candidates=0 if i == 2 else 25, reason=AWKWARD) for i in range(5)] + [posed(5)]
     path = write(tmp_path / "e.csv", rows)
     truth = np.array([[628_700.0 + 10 * i, 5_803_600.0] if here else [np.nan] * 2 for i, here in enumerate(known)])
     table = estimates.add_truth(path, truth, FRAME)
@@ -159,6 +270,10 @@ def test_geojson_is_rfc_7946(tmp_path: Path, known: list[int]) -> None:
     assert kinds.count("truth") == (1 if any(known) else 0)
     assert kinds.count("fix") == 6
     assert kinds.count("candidates") == 5
+    assert kinds.count("hypotheses") == 1
+    properties = [f["properties"] for f in document["features"] if f["properties"].get("scan") == 5]
+    assert properties[0]["state"] == "localized"
+    assert properties[0]["heading_deg"] == pytest.approx(np.degrees(0.3), abs=0.01)
     if any(known):
         assert len(positions(document["features"][0]["geometry"])) == sum(known)
     unlocated = [f for f in document["features"] if f["properties"].get("scan") == 2]

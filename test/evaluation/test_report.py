@@ -17,7 +17,7 @@ from PIL import Image
 from crossloc3d_ros.clouds.raster import Raster
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation import backdrop, charts, report
-from crossloc3d_ros.evaluation.estimates import EstimateTable
+from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
 from crossloc3d_ros.evaluation.replay import Evaluation, score_table
 from crossloc3d_ros.evaluation.truth import TruthTrack
 from crossloc3d_ros.places.store import AerialMap
@@ -81,7 +81,13 @@ def made_up_table(
         grid=grid,
         covariance=np.tile(np.diag([900.0, 400.0, 9.0]), (scans, 1, 1)),
         timings_ms=np.column_stack(
-            [rng.uniform(4, 6, scans), rng.uniform(9, 14, scans), np.full(scans, 0.3), rng.uniform(15, 21, scans)]
+            [
+                rng.uniform(4, 6, scans),
+                rng.uniform(9, 14, scans),
+                np.full(scans, 0.3),
+                *np.full((2, scans), np.nan),
+                rng.uniform(15, 21, scans),
+            ]
         ),
         points=np.full((scans, 2), 4096),
         candidate_ids=ids,
@@ -89,6 +95,13 @@ def made_up_table(
         candidate_probabilities=rng.dirichlet(np.ones(top), scans) if top else np.empty((scans, 0)),
         candidate_grid=town_map.submaps.grid[ids, :2],
         truth_grid=place if truth else np.full((scans, 2), np.nan),
+        truth_heading_rad=np.full(scans, np.nan),
+        states=(None,) * scans,
+        probability=np.full(scans, np.nan),
+        heading_rad=np.full(scans, np.nan),
+        heading_std_rad=np.full(scans, np.nan),
+        aligned=no_pose_lists(scans),
+        hypotheses=no_pose_lists(scans),
         reasons=tuple(reason or f"reason {i % 3}" for i in range(scans)),
     )
 
