@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, ScanConfig, to_dict
 from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.evaluation.raw_scans import RawScan
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet, join_places
 from crossloc3d_ros.evaluation.simulated import scan_places, sources_digest
 from crossloc3d_ros.places.builder import build_map
@@ -116,8 +117,8 @@ def make_amsterdam_set(
     town = world_from_survey([surveys / DRIVE_SURVEY], seed=benchmark.drive_seed, progress=report)
     if town.crs != crs:
         raise EvaluationError(f"the two surveys of {surveys} lie in different UTM zones ({crs}, {town.crs})")
-    driven = _drive(town, benchmark, preprocessing)
-    spread = _spread(town, benchmark, preprocessing)
+    driven = _prepared(raw_drive(town, benchmark), benchmark, preprocessing)
+    spread = _prepared(raw_spread(town, benchmark), benchmark, preprocessing)
     queries = join_places([_in_grid(driven, town), _in_grid(spread, town)], [0, 0])
     groups = (DRIVE,) * len(driven) + (SPREAD,) * len(spread)
     return EvaluationSet("amsterdam", queries, submaps, None, ("Amsterdam",), ("real old town",), groups)
@@ -147,7 +148,8 @@ def built_submaps(
     return places, built.manifest.crs
 
 
-def _drive(town: World, benchmark: AmsterdamBenchmark, preprocessing: PreprocessingConfig) -> PlaceSet:
+def raw_drive(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
+    """Yield scans along the demo's drive, with poses in the town's local frame."""
     rng = np.random.default_rng([benchmark.drive_seed, 1])
     way = plan_route(
         town,
@@ -162,40 +164,37 @@ def _drive(town: World, benchmark: AmsterdamBenchmark, preprocessing: Preprocess
     every = np.arange(np.interp(first, way.time_s, along), along[-1], benchmark.drive_every_m)
     # Along a drive that stands still now and then, many times share one place: the first of them counts.
     moments = way.time_s[np.searchsorted(along, every)]
-    return _scans(town, way.at(moments), way.twist(moments), benchmark, preprocessing, benchmark.drive_seed)
+    return _raw_scans(town, way.at(moments), way.twist(moments), benchmark, benchmark.drive_seed)
 
 
-def _spread(town: World, benchmark: AmsterdamBenchmark, preprocessing: PreprocessingConfig) -> PlaceSet:
+def raw_spread(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
+    """Yield scans at places and in headings drawn by lot, with poses in the town's local frame."""
     rng = np.random.default_rng(benchmark.spread_seed)
     poses = town.sample_poses(benchmark.spread, rng, clearance_m=benchmark.clearance_m, border_m=benchmark.border_m)
     twists = np.zeros((len(poses), 6))
     twists[:, 0] = rng.uniform(0.0, 2.0, len(poses))
     twists[:, 5] = rng.uniform(-0.5, 0.5, len(poses))
-    return _scans(town, poses, twists, benchmark, preprocessing, benchmark.spread_seed)
+    return _raw_scans(town, poses, twists, benchmark, benchmark.spread_seed)
 
 
-def _scans(
-    town: World,
-    poses: Float64Array,
-    twists: Float64Array,
-    benchmark: AmsterdamBenchmark,
-    preprocessing: PreprocessingConfig,
-    seed: int,
-) -> PlaceSet:
-    """Scan from poses (S, 4, 4) at twists (S, 6) of the base; scans without a patch fall away."""
+def _raw_scans(
+    town: World, poses: Float64Array, twists: Float64Array, benchmark: AmsterdamBenchmark, seed: int
+) -> Iterator[RawScan]:
+    """Scan from poses (S, 4, 4) at twists (S, 6) of the base."""
     rng = np.random.default_rng([seed, 2])
     sensor = Vlp16(benchmark.sensor)
     T_base_lidar = mounting_matrix(benchmark.scan.mounting)
     R = T_base_lidar[:3, :3]
-    prepared = []
     for pose, twist in zip(poses, twists, strict=True):
         velocity = twist[:3] + np.cross(twist[3:], T_base_lidar[:3, 3])
         lidar_twist = np.concatenate([R.T @ velocity, R.T @ twist[3:]])
-        scan = sensor.scan(town.scene, pose @ T_base_lidar, rng, lidar_twist).as_scan()
-        patch = prepare_scan(scan, benchmark.scan, preprocessing).patch
-        if patch is not None:
-            prepared.append((pose, patch.points))
-    return scan_places(prepared, preprocessing)
+        yield RawScan(sensor.scan(town.scene, pose @ T_base_lidar, rng, lidar_twist).points, pose, T_base_lidar)
+
+
+def _prepared(scans: Iterable[RawScan], benchmark: AmsterdamBenchmark, preprocessing: PreprocessingConfig) -> PlaceSet:
+    """Return the places of scans; those without a patch fall away."""
+    patches = [(scan.T_grid_base, prepare_scan(scan.as_scan(), benchmark.scan, preprocessing).patch) for scan in scans]
+    return scan_places([(pose, patch.points) for pose, patch in patches if patch is not None], preprocessing)
 
 
 def _in_grid(places: PlaceSet, town: World) -> PlaceSet:

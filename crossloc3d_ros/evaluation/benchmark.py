@@ -6,11 +6,11 @@ import fcntl
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.errors import ConfigError, EvaluationError
@@ -30,6 +30,7 @@ BENCHMARKS: dict[str, SimulatedBenchmark | AmsterdamBenchmark] = {
 }
 
 Progress = Callable[[str, float, float, str], None]
+Task = TypeVar("Task")
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,12 @@ def open_benchmark(
         return _open_simulated(name, benchmark, data, preprocessing, workers, report)
     if surveys is None:
         raise EvaluationError(f"the benchmark '{name}' needs the folder of its two surveys")
-    settings = _plain(amsterdam.settings_of(benchmark, surveys, preprocessing))
-    folder = _folder(data, name, settings)
+    settings = plain(amsterdam.settings_of(benchmark, surveys, preprocessing))
+    folder = folder_of(data, name, settings)
     made = _current(folder, settings)
     if made is not None:
         return made
-    with _alone(folder):
+    with alone(folder):
         if (made := _current(folder, settings)) is None:
             save_set(folder, amsterdam.make_amsterdam_set(benchmark, surveys, preprocessing, data, report), settings)
             made = load_set(folder, verify=True)
@@ -84,8 +85,8 @@ def _open_simulated(
     workers: int,
     report: Progress,
 ) -> EvaluationSet:
-    settings = _plain(simulated.settings_of(benchmark, preprocessing))
-    folder = _folder(data, name, settings)
+    settings = plain(simulated.settings_of(benchmark, preprocessing))
+    folder = folder_of(data, name, settings)
     folders = {town: folder / f"{town.family}_{town.seed}" for town in benchmark.towns}
 
     def finished() -> dict[BenchmarkTown, EvaluationSet]:
@@ -94,7 +95,7 @@ def _open_simulated(
     made = finished()
     if len(made) == len(benchmark.towns):
         return join_sets(name, [made[town] for town in benchmark.towns])
-    with _alone(folder):
+    with alone(folder):
         made = finished()
         missing = [town for town in benchmark.towns if town not in made]
         done, total = len(made), len(benchmark.towns)
@@ -106,16 +107,13 @@ def _open_simulated(
             report("making", done, total, "towns")
 
         tasks = [_TownTask(town, benchmark, preprocessing, folders[town], settings) for town in missing]
-        nobody = cast(DescriptorEncoder, None)  # towns are made without an encoder
-        with open_workers(_no_encoder, nobody, workers, None, folder) as pool:
-            for _ in pool.run(_make_town, ((task, 1) for task in tasks), advance):
-                pass
+        without_encoder(_make_town, tasks, workers, folder, advance)
         made |= {town: load_set(folders[town], verify=True) for town in missing}
     return join_sets(name, [made[town] for town in benchmark.towns])
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def alone(folder: Path) -> Iterator[None]:
     """Wait until no other process makes the same set; what it has made is found then."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -138,6 +136,20 @@ def _make_town(task: _TownTask, advance: Callable[[int], None] | None) -> None:
         advance(1)
 
 
+def without_encoder(
+    make: Callable[[Task, Callable[[int], None] | None], None],
+    tasks: Sequence[Task],
+    workers: int,
+    folder: Path,
+    advance: Callable[[int], None],
+) -> None:
+    """Do tasks that need no encoder, in so many processes; `advance` is told of each that is done."""
+    nobody = cast(DescriptorEncoder, None)
+    with open_workers(_no_encoder, nobody, workers, None, folder) as pool:
+        for _ in pool.run(make, ((task, 1) for task in tasks), advance):
+            pass
+
+
 def _no_encoder() -> DescriptorEncoder:
     raise AssertionError("towns are made without an encoder")
 
@@ -156,7 +168,7 @@ def _current(folder: Path, settings: dict[str, Any]) -> EvaluationSet | None:
     return None
 
 
-def _folder(data: Path, name: str, settings: dict[str, Any]) -> Path:
+def folder_of(data: Path, name: str, settings: dict[str, Any]) -> Path:
     """Return where a set of these settings lies, and say so where older ones lie beside it."""
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     folder = data / f"{name}-{key}"
@@ -173,6 +185,6 @@ def _folder(data: Path, name: str, settings: dict[str, Any]) -> Path:
     return folder
 
 
-def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+def plain(settings: dict[str, Any]) -> dict[str, Any]:
     """Return settings as they come back from JSON."""
     return dict(json.loads(json.dumps(settings)))

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import inspect
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -21,6 +22,7 @@ from crossloc3d_ros.clouds.raster import surface_raster, terrain_raster
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import BuildConfig, MountingConfig, PreprocessingConfig, ScanConfig, to_dict
+from crossloc3d_ros.evaluation.raw_scans import RawScan
 from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.formats.las import GROUND
 from crossloc3d_ros.places.tile import coverage, distance_to_points, ground_heights, margin_m
@@ -207,18 +209,30 @@ def _scans(
     poses = world.sample_poses(
         count, rng, clearance_m=benchmark.clearance_m, border_m=benchmark.border_m, tilt_deg=benchmark.tilt_deg
     )
-    sensor = Vlp16(benchmark.sensor)
     prepared = []
+    for raw in raw_scans(world, poses, benchmark, rng):
+        mounting = MountingConfig(z_m=float(raw.T_base_lidar[2, 3]))
+        patch = prepare_scan(raw.as_scan(), ScanConfig(mounting=mounting), preprocessing, raw.up_base).patch
+        if patch is not None:
+            prepared.append((raw.T_grid_base, patch.points))
+    return scan_places(prepared, preprocessing)
+
+
+def raw_scans(
+    world: World, poses: Float64Array, benchmark: SimulatedBenchmark, rng: np.random.Generator
+) -> Iterator[RawScan]:
+    """Yield a scan of each local pose (S, 4, 4), by robots of different heights, with and without an IMU.
+
+    The poses of the scans are those given, in the world's local frame.
+    """
+    sensor = Vlp16(benchmark.sensor)
     for pose in poses:
-        mounting = MountingConfig(z_m=float(rng.uniform(*benchmark.sensor_height_m)))
+        T_base_lidar = mounting_matrix(MountingConfig(z_m=float(rng.uniform(*benchmark.sensor_height_m))))
         twist = np.array([rng.uniform(0.0, 2.0), 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5)])
-        scan = sensor.scan(world.scene, pose @ mounting_matrix(mounting), rng, twist).as_scan()
+        points = sensor.scan(world.scene, pose @ T_base_lidar, rng, twist).points
         levelled = rng.random() < benchmark.imu_share
         up = pose[2, :3] + rng.normal(0.0, 0.004, 3)
-        patch = prepare_scan(scan, ScanConfig(mounting=mounting), preprocessing, up if levelled else None).patch
-        if patch is not None:
-            prepared.append((pose, patch.points))
-    return scan_places(prepared, preprocessing)
+        yield RawScan(points, pose, T_base_lidar, up if levelled else None)
 
 
 def scan_places(prepared: list[tuple[Float64Array, Float32Array]], preprocessing: PreprocessingConfig) -> PlaceSet:
