@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.errors import BagError
-from crossloc3d_ros.evaluation.truth import TruthTrack, find_truth_topic, read_truth
+from crossloc3d_ros.evaluation.truth import TruthTrack, find_heading_topic, find_truth_topic, read_heading, read_truth
 from crossloc3d_ros.formats import bag
 from crossloc3d_ros.geodesy import MapFrame
 
@@ -125,3 +125,70 @@ def test_of_a_recording_that_breaks_off_the_whole_part_counts(
         monkeypatch.setattr(reader, "messages", lambda topics: broken(0))
         with pytest.raises(BagError, match=r"drive\.db3"):
             read_truth(reader, "/gnss", FRAME)
+
+
+def test_nothing_is_made_up_where_the_robot_was_carried() -> None:
+    truth = track([0, 1, 1.2, 2.2], [0.0, 10.0, 500.0, 510.0])
+    np.testing.assert_allclose(at(truth, 0.5, 1.1, 1.2, 1.7), [5.0, np.nan, 500.0, 505.0])
+
+
+def write_truth(path: Path, headings: list[float], turned_rad: float = 0.0) -> Path:
+    """Write a drive along an arc of 200 m and more, with its headings, in a frame turned by some angle."""
+    with bag.BagWriter(path) as writer:
+        place = np.array([628_700.0, 5_803_600.0, 2.0])
+        convergence = float(FRAME.convergence_rad(place[None])[0])
+        for i, heading in enumerate(headings):
+            stamp = START + i * SECOND
+            latitude, longitude, _ = FRAME.to_geographic(place[None])
+            fix = bag.nav_sat_fix(stamp, "gnss", float(latitude[0]), float(longitude[0]), float("nan"), np.eye(3))
+            writer.write("/ground_truth/fix", bag.NAV_SAT_FIX, stamp, fix)
+            x, y, _ = FRAME.to_enu(place[None])[0]
+            turn = np.exp(1j * turned_rad)
+            told = turn * complex(x, y)
+            yaw = heading + turned_rad
+            message = bag.odometry(
+                stamp, "world", "base_link", (told.real, told.imag, 0.0), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+            )
+            writer.write("/ground_truth/odom", bag.ODOMETRY, stamp, message)
+            way = heading + convergence  # from grid east
+            place = place + 10.0 * np.array([np.cos(way), np.sin(way), 0.0])
+    return path
+
+
+def test_true_headings_are_found_and_cross_the_seam(tmp_path: Path) -> None:
+    headings = list(np.linspace(2.2, 4.2, 30))
+    with bag.open_bag(write_truth(tmp_path / "drive", headings)) as reader:
+        truth = read_truth(reader, "/ground_truth/fix", FRAME)
+        topic = find_heading_topic(reader)
+        assert topic == "/ground_truth/odom"
+        track = read_heading(reader, topic, truth, FRAME)
+    assert track is not None
+    assert truth.std_m == 1.0
+    between = START + np.array([-1, 0, 500_000_000, 14 * SECOND + 250_000_000, 29 * SECOND, 29 * SECOND + 1])
+    expected = np.interp([0, 0, 0.5, 14.25, 29, 29], np.arange(30), headings)
+    off = np.angle(np.exp(1j * (track.at(between) - expected)))
+    np.testing.assert_allclose(off, [np.nan, 0, 0, 0, 0, np.nan], atol=1e-9)
+
+
+@pytest.mark.parametrize("turned_deg", [-90.0, 5.0])
+def test_headings_from_a_frame_of_their_own_are_left_out(
+    tmp_path: Path, turned_deg: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_truth(tmp_path / "drive", list(np.linspace(0.0, 1.0, 30)), np.radians(turned_deg))
+    with bag.open_bag(path) as reader:
+        truth = read_truth(reader, "/ground_truth/fix", FRAME)
+        assert read_heading(reader, "/ground_truth/odom", truth, FRAME) is None
+    assert f"turned by {turned_deg:.1f} degrees" in caplog.text
+
+
+def test_an_orientation_that_was_never_filled_in_is_no_heading(tmp_path: Path) -> None:
+    with bag.BagWriter(tmp_path / "drive") as writer:
+        for i, quaternion in enumerate([(0, 0, 0, 0), (0, 0, 0, float("nan")), (0, 0, 1, 0)]):
+            stamp = START + i
+            message = bag.odometry(stamp, "world", "base_link", (0, 0, 0), quaternion)
+            writer.write("/ground_truth/odom", bag.ODOMETRY, stamp, message)
+    with bag.open_bag(tmp_path / "drive") as reader:
+        headings = read_heading(reader, "/ground_truth/odom", track([], []), FRAME)
+    assert headings is not None
+    assert headings.stamp_ns.tolist() == [START + 2]
+    assert abs(headings.heading_rad[0]) == pytest.approx(np.pi)
