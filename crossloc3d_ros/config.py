@@ -116,12 +116,47 @@ class CredibilityConfig:
 
 
 @dataclass(frozen=True)
+class FusionConfig:
+    """From the aligned poses of scan after scan, and odometry, to one pose that may be driven by."""
+
+    min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
+    confirm_m: float = option(3.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
+    max_hypotheses: int = option(16, "poses carried along at most", low=1, high=1000)
+    evidence_m: float = option(10.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
+    evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
+    blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
+    found_share: float = option(
+        0.7, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
+    )
+    carried_per_s: float = option(1e-3, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
+    prior_belief: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)
+    error_scale: float = option(1.0, "factor on the standard deviations of aligned poses", low=0.1, high=100.0)
+    error_share: float = option(
+        0.8, "share of an aligned pose's variance that the next scan's error has in common", low=0.0, high=0.99
+    )
+    error_m: float = option(5.0, "way over which that common error changes", low=0.1, high=1000.0)
+    position_floor_m: float = option(0.1, "least standard deviation of an aligned pose", low=0.01, high=10.0)
+    heading_floor_deg: float = option(0.2, "the same of its heading", low=0.01, high=10.0)
+    map_error_m: float = option(0.1, "error of the map itself, one sigma, on top of every estimate", low=0.0, high=10.0)
+    odometry_error: float = option(0.05, "of odometry, one sigma, share of the way and of the turn", low=1e-4, high=1.0)
+    odometry_turn_deg_per_m: float = option(0.3, "what it turns too much or too little a metre", low=0.0, high=45.0)
+    odometry_gap_s: float = option(0.5, "over a longer gap between its samples it is unknown", low=0.01, high=60.0)
+    slip_m: float = option(1.0, "size of an error of odometry beyond all bounds, one sigma", low=0.01, high=100.0)
+    slip_share: float = option(1e-3, "share of the scans before which there is one", low=0.0, high=0.5)
+    max_speed_mps: float = option(10.0, "the robot drives no faster", low=0.1, high=200.0)
+    max_turn_deg_per_s: float = option(120.0, "and turns no faster", low=1.0, high=10_000.0)
+    forget_s: float = option(10.0, "time of unknown motion that leaves a belief of 1/e", low=0.1, high=1e5)
+    restart_s: float = option(3.0, "a stamp farther back begins a new recording: all is forgotten", low=0.0, high=1e5)
+
+
+@dataclass(frozen=True)
 class LocalizerConfig:
     """From a scan to an estimate."""
 
     top_k: int = option(25, "candidates to retrieve", low=1, high=1000)
     scan: ScanConfig = field(default_factory=ScanConfig, metadata={"text": "use of the scan"})
     credibility: CredibilityConfig = field(default_factory=CredibilityConfig, metadata={"text": "what is believed"})
+    fusion: FusionConfig = field(default_factory=FusionConfig, metadata={"text": "poses over time"})
 
 
 @dataclass(frozen=True)
