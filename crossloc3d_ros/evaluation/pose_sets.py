@@ -196,7 +196,7 @@ def make_pose_set(
     folder = benchmark.folder_of(data, f"pose-{name}", settings)
     parts = _parts_of(poses, folder, settings)
     with benchmark.alone(folder):
-        missing = [part for part in parts if not _is_made(part.folder, part.settings)]
+        missing = [part for part in parts if not is_made(part.folder, part.settings)]
         done, total = len(parts) - len(missing), len(parts)
 
         def advance(towns: int) -> None:
@@ -306,7 +306,7 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
     """Fly a town at one epoch where it is on the map, and scan it at the other."""
     examined, town = part.poses.examined, part.town
     epoch = town.seed % 2
-    with _whole(part.folder) as partial:
+    with whole(part.folder) as partial:
         if part.corner is not None:
             world, flown = placed_town(town, epoch, examined.town_size_m, part.corner)
             world = dataclasses.replace(world, bounds=flown)
@@ -318,13 +318,14 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
         local = world.sample_poses(
             count, rng, clearance_m=examined.clearance_m, border_m=0.0, tilt_deg=examined.tilt_deg
         )
-        save_scans(partial, RawScans.of(_in_grid(scan, world) for scan in raw_scans(world, local, examined, rng)))
-        _mark_made(partial, part.settings)
+        save_scans(partial, RawScans.of(to_grid(scan, world) for scan in raw_scans(world, local, examined, rng)))
+        mark_made(partial, part.settings)
     if advance is not None:
         advance(1)
 
 
-def _in_grid(scan: RawScan, world: World, group: int = 0) -> RawScan:
+def to_grid(scan: RawScan, world: World, group: int = 0) -> RawScan:
+    """Return a scan whose pose is local to a world with its pose in the world's grid."""
     pose: Float64Array = scan.T_grid_base.copy()
     pose[:3, 3] = world.to_grid(pose[None, :3, 3])[0]
     return dataclasses.replace(scan, T_grid_base=pose, group=group)
@@ -344,13 +345,13 @@ def _make_amsterdam(
     del settings["preprocessing"]  # raw scans do not depend on it
     folder = benchmark.folder_of(data, f"pose-{name}", settings)
     with benchmark.alone(folder):
-        if not _is_made(folder / "scans", settings):
+        if not is_made(folder / "scans", settings):
             town = world_from_survey([surveys / amsterdam.DRIVE_SURVEY], seed=examined.drive_seed, progress=report)
-            with _whole(folder / "scans") as partial:
-                driven = [_in_grid(scan, town, 0) for scan in amsterdam.raw_drive(town, examined)]
-                spread = [_in_grid(scan, town, 1) for scan in amsterdam.raw_spread(town, examined)]
+            with whole(folder / "scans") as partial:
+                driven = [to_grid(scan, town, 0) for scan in amsterdam.raw_drive(town, examined)]
+                spread = [to_grid(scan, town, 1) for scan in amsterdam.raw_spread(town, examined)]
                 save_scans(partial, RawScans.of([*driven, *spread]))
-                _mark_made(partial, settings)
+                mark_made(partial, settings)
         map_folder = _make_map(folder, [surveys / amsterdam.MAP_SURVEY], examined, lambda: encoder, 1, report)
         _write_manifest(
             folder,
@@ -390,7 +391,7 @@ def _make_map(
 
 
 @contextmanager
-def _whole(folder: Path) -> Iterator[Path]:
+def whole(folder: Path) -> Iterator[Path]:
     """Give a folder to write in that takes the name `folder` when all went well, in place of an older one."""
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -405,11 +406,13 @@ def _whole(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _mark_made(folder: Path, settings: dict[str, Any]) -> None:
+def mark_made(folder: Path, settings: dict[str, Any]) -> None:
+    """Write down how the content of a folder was made, the last thing of all."""
     (folder / _MADE).write_text(json.dumps(settings), encoding="utf-8")
 
 
-def _is_made(folder: Path, settings: dict[str, Any]) -> bool:
+def is_made(folder: Path, settings: dict[str, Any]) -> bool:
+    """Say whether a folder is whole and was made in this way."""
     try:
         made: object = json.loads((folder / _MADE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
