@@ -94,6 +94,8 @@ setup(
     extras_require={
         # Where ROS 2 Jazzy is not installed: the real client and middleware as wheels.
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp"],
+        # Where the robot has no odometry of its own: from scan to scan.
+        "odometry": ["kiss-icp>=1.2"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "test": [
             "hypothesis>=6",

@@ -1,0 +1,233 @@
+"""How the robot has moved between two scans: from samples of odometry, or from the scans themselves."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from crossloc3d_ros.config import FusionConfig
+from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.types import Float64Array
+
+_KEPT_NS = 120_000_000_000
+_STAND_STILL_M = 0.01  # one sigma of a motion's position and, in radians, a tenth of it of its heading: never 0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """From one scan to the next, in the levelled base frame of the first."""
+
+    delta: Float64Array
+    """(3,) forward m, left m, turn rad counter-clockwise; zeros where unknown."""
+    covariance: Float64Array
+    """(3, 3) of the same: m2, m rad, rad2."""
+    is_known: bool = True
+    """False: no odometry tells this stretch."""
+    reason: str = ""
+    """One sentence for people: why it is unknown."""
+
+
+def unknown_motion(reason: str) -> Motion:
+    """Return the motion of a stretch that no odometry tells."""
+    return Motion(np.zeros(3), np.zeros((3, 3)), is_known=False, reason=reason)
+
+
+class OdometryBuffer:
+    """Keep the samples of an odometry and tell the motion between any two stamps.
+
+    One thread may feed it while another asks.
+    """
+
+    def __init__(self, config: FusionConfig) -> None:
+        self._config = config
+        self._lock = threading.Lock()
+        self._stamps_ns: list[int] = []
+        self._poses: list[tuple[float, float, float]] = []  # x, y, heading in the odometry's frame, levelled
+        self._jumps: list[str] = []  # what is impossible in the step that ends at the sample; empty where nothing is
+        self._refused = ""
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample; None where there is none."""
+        return self._stamps_ns[-1] if self._stamps_ns else None
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        with self._lock:
+            self._clear()
+
+    def add(self, stamp_ns: int, T_odom_base: Float64Array) -> bool:
+        """Take in one pose (4, 4) of the base, and return whether it can be used.
+
+        Late and repeated samples and poses that are none are left out; a stamp that lies back by more than `restart_s`
+        begins anew.
+        """
+        pose = _planar(np.asarray(T_odom_base, dtype=np.float64))
+        with self._lock:
+            if pose is None:
+                self._refused = "the last pose of the odometry is not a pose"
+                return False
+            self._refused = ""
+            if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+                if self._stamps_ns[-1] - stamp_ns <= self._config.restart_s * 1e9:
+                    return False
+                self._clear()
+            self._jumps.append(self._impossible(stamp_ns, pose))
+            self._stamps_ns.append(stamp_ns)
+            self._poses.append(pose)
+            if stamp_ns - self._stamps_ns[0] > 2 * _KEPT_NS:
+                old = bisect.bisect_left(self._stamps_ns, stamp_ns - _KEPT_NS)
+                del self._stamps_ns[:old], self._poses[:old], self._jumps[:old]
+        return True
+
+    def motion(self, from_ns: int, to_ns: int) -> Motion:
+        """Return how the base moved between two stamps, by interpolation.
+
+        Beyond the newest sample it goes on as before for up to `odometry_gap_s`. Unknown where there are no samples,
+        a gap, a jump that no robot drives, or time that goes backwards.
+        """
+        with self._lock:
+            stamps, poses = self._stamps_ns, self._poses
+            gap_ns = int(self._config.odometry_gap_s * 1e9)
+            reason = self._why_unknown(from_ns, to_ns, gap_ns)
+            if reason:
+                return unknown_motion(reason)
+            first, last = bisect.bisect_right(stamps, from_ns), bisect.bisect_left(stamps, to_ns)
+            way = np.array([self._at(from_ns), *poses[first:last], self._at(to_ns)])
+        steps = np.diff(way, axis=0)
+        turns = _wrap(steps[:, 2])
+        heading = way[0, 2]
+        east, north = way[-1, :2] - way[0, :2]
+        cosine, sine = math.cos(heading), math.sin(heading)
+        delta = np.array([cosine * east + sine * north, -sine * east + cosine * north, turns.sum()])
+        length_m, turned_rad = float(np.hypot(steps[:, 0], steps[:, 1]).sum()), float(np.abs(turns).sum())
+        return Motion(delta, motion_covariance(length_m, turned_rad, self._config))
+
+    def _clear(self) -> None:
+        self._stamps_ns, self._poses, self._jumps = [], [], []
+
+    def _impossible(self, stamp_ns: int, pose: tuple[float, float, float]) -> str:
+        """Say what no robot does between the newest sample and this one; empty where it is possible."""
+        if not self._poses:
+            return ""
+        before = self._poses[-1]
+        # A burst of samples with the jitter of its stamps is no jump: a hundredth of a second is granted.
+        elapsed_s = (stamp_ns - self._stamps_ns[-1]) * 1e-9 + 0.01
+        moved_m = math.hypot(pose[0] - before[0], pose[1] - before[1])
+        turned_deg = abs(math.degrees(_wrap(pose[2] - before[2])))
+        if moved_m > self._config.max_speed_mps * elapsed_s + 0.05:
+            return f"the odometry jumps by {moved_m:.2g} m in {elapsed_s:.2g} s"
+        if turned_deg > self._config.max_turn_deg_per_s * elapsed_s + 1.0:
+            return f"the odometry jumps by {turned_deg:.0f} degrees in {elapsed_s:.2g} s"
+        return ""
+
+    def _why_unknown(self, from_ns: int, to_ns: int, gap_ns: int) -> str:
+        stamps = self._stamps_ns
+        if to_ns < from_ns:
+            return f"time goes backwards by {(from_ns - to_ns) * 1e-9:.2g} s"
+        if not stamps:
+            return self._refused or "there is no odometry"
+        if from_ns < stamps[0]:
+            return f"the odometry begins {(stamps[0] - from_ns) * 1e-9:.2g} s after the last scan"
+        if to_ns > stamps[-1] + gap_ns:
+            return self._refused or f"the odometry has stopped {(to_ns - stamps[-1]) * 1e-9:.2g} s before the scan"
+        # Every step that the stretch touches, from the sample at or before its begin to the one at or after its end.
+        begin = bisect.bisect_right(stamps, from_ns) - 1
+        end = min(bisect.bisect_left(stamps, to_ns), len(stamps) - 1)
+        steps = np.diff(stamps[begin : end + 1])
+        if len(steps) and steps.max() > gap_ns:
+            return f"the odometry has a gap of {steps.max() * 1e-9:.2g} s"
+        return next((jump for jump in self._jumps[begin + 1 : end + 1] if jump), "")
+
+    def _at(self, stamp_ns: int) -> tuple[float, float, float]:
+        """Return the pose at a stamp: between two samples, or beyond the newest as between the last two."""
+        stamps, poses = self._stamps_ns, self._poses
+        after = bisect.bisect_left(stamps, stamp_ns)
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return poses[after]
+        if after == len(stamps):
+            if len(stamps) == 1 or stamps[-1] - stamps[-2] > self._config.odometry_gap_s * 1e9 or self._jumps[-1]:
+                return poses[-1]
+            after -= 1
+        (x0, y0, heading0), (x1, y1, heading1) = poses[after - 1], poses[after]
+        share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        turn = float(_wrap(heading1 - heading0))
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0), heading0 + share * turn
+
+
+class ScanOdometry:
+    """Odometry from scan to scan, by KISS-ICP (Vizzo et al., RA-L 2023), for a robot that has no other."""
+
+    def __init__(self, config: FusionConfig, max_range_m: float = 100.0) -> None:
+        """Set up KISS-ICP; ConfigError where the library is not installed."""
+        self._max_range_m = max_range_m
+        self._odometry = _kiss_icp(max_range_m)
+        self._buffer = OdometryBuffer(config)
+
+    def reset(self) -> None:
+        """Forget the scans seen so far."""
+        self._odometry = _kiss_icp(self._max_range_m)
+        self._buffer.reset()
+
+    def add(self, stamp_ns: int, points: Float64Array) -> bool:
+        """Take in one scan (N, 3), metres, base frame, and return whether it can be used."""
+        newest_ns = self._buffer.newest_ns
+        if newest_ns is not None and stamp_ns <= newest_ns:
+            if not self._buffer.add(stamp_ns, np.eye(4)):
+                return False
+            self.reset()
+        finite = np.asarray(points, dtype=np.float64)
+        finite = finite[np.isfinite(finite).all(axis=1)]
+        self._odometry.register_frame(np.ascontiguousarray(finite), np.empty(0))
+        return self._buffer.add(stamp_ns, np.asarray(self._odometry.last_pose))
+
+    def motion(self, from_ns: int, to_ns: int) -> Motion:
+        """Return how the base moved between the stamps of two scans."""
+        return self._buffer.motion(from_ns, to_ns)
+
+
+def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) -> Float64Array:
+    """Return the covariance (3, 3) of a motion along a way of `length_m` with turns of `turned_rad` in all."""
+    position = (config.odometry_error * length_m) ** 2 + _STAND_STILL_M**2
+    drift = math.radians(config.odometry_turn_deg_per_m) * length_m
+    heading = (config.odometry_error * turned_rad) ** 2 + drift**2 + (0.1 * _STAND_STILL_M) ** 2
+    return np.diag([position, position, heading])
+
+
+def _planar(T_odom_base: Float64Array) -> tuple[float, float, float] | None:
+    """Return x, y and heading of a pose; None where the matrix (4, 4) is no pose, or stands on its nose."""
+    if T_odom_base.shape != (4, 4) or not np.isfinite(T_odom_base).all():
+        return None
+    rotation = T_odom_base[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or math.hypot(rotation[0, 0], rotation[1, 0]) < 0.1:
+        return None
+    return float(T_odom_base[0, 3]), float(T_odom_base[1, 3]), math.atan2(rotation[1, 0], rotation[0, 0])
+
+
+def _wrap(angle_rad: Any) -> Any:
+    """Return the angle, or angles, in [-pi, pi)."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _kiss_icp(max_range_m: float) -> Any:
+    try:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError as error:
+        raise ConfigError(
+            "odometry from scan to scan needs the library KISS-ICP: pip install 'crossloc3d_ros[odometry]'"
+        ) from error
+    settings = load_config(None)
+    settings.data.max_range = max_range_m
+    settings.data.deskew = False  # the points carry no times
+    settings.mapping.voxel_size = max_range_m / 100.0
+    settings.registration.max_num_threads = 1
+    return KissICP(settings)
