@@ -68,6 +68,11 @@ class SimulatedPoses:
     off_map_scans: int = 0
     """Scans in each of them."""
 
+    def corner(self, town: int) -> tuple[float, float]:
+        """Return the south-western corner of a town's square, metres from the mosaic's."""
+        row, column = divmod(town, self.columns)
+        return column * self.examined.town_size_m, row * self.examined.town_size_m
+
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
@@ -275,12 +280,9 @@ def _settings_of(poses: SimulatedPoses) -> dict[str, Any]:
 
 
 def _parts_of(poses: SimulatedPoses, folder: Path, settings: dict[str, Any]) -> list[_Part]:
-    side = poses.examined.town_size_m
     parts = []
     for i, town in enumerate(poses.examined.towns):
-        row, column = divmod(i, poses.columns)
-        place = folder / f"{town.family}_{town.seed}"
-        parts.append(_Part(place, settings, poses, town, (column * side, row * side)))
+        parts.append(_Part(folder / f"{town.family}_{town.seed}", settings, poses, town, poses.corner(i)))
     for town in poses.off_map:
         parts.append(_Part(folder / f"{town.family}_{town.seed}", settings, poses, town, None))
     return parts
