@@ -34,6 +34,7 @@ from crossloc3d_ros.evaluation.replay import (
     GEOJSON,
     SUMMARY,
     Evaluation,
+    OdometrySource,
     evaluate,
     latency_summary,
     localize_bag,
@@ -41,7 +42,7 @@ from crossloc3d_ros.evaluation.replay import (
 )
 from crossloc3d_ros.evaluation.report import About, write_report
 from crossloc3d_ros.evaluation.truth import find_truth_topic
-from crossloc3d_ros.formats.bag import IMU, POINT_CLOUD, BagReader, open_bag
+from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.places.store import AerialMap
 
@@ -82,6 +83,13 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--device", help="where to encode: cpu or cuda (default: cpu)")
     localize.add_argument("--gnss-topic", help="NavSatFix topic to score against (default: ground truth, or the only)")
     localize.add_argument("--imu-topic", help="Imu topic, axes of the base, to level the scans by (default: none)")
+    localize.add_argument(
+        "--odometry",
+        choices=("topic", "scan", "none"),
+        help="how the robot has moved between scans: told by a topic, by the scans themselves (KISS-ICP), or unknown "
+        "(default: topic, where the recording has one)",
+    )
+    localize.add_argument("--odom-topic", help="Odometry topic (default: the only one beside ground truth, or /odom)")
     localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
     localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
     localize.add_argument(
@@ -121,12 +129,14 @@ def _replay(arguments: argparse.Namespace) -> int:
         find_truth_topic(bag, arguments.gnss_topic)
         if arguments.imu_topic is not None:
             bag.topic(arguments.imu_topic, IMU)
+        odometry = choose_odometry(bag, arguments.odom_topic, config, asked_for=arguments.odometry is not None)
         weights = Path(config.weights) if config.weights else None
         encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
         aerial_map = AerialMap.load(config.map, encoder.fingerprint)
         localizer = Localizer(aerial_map, encoder, config)
         remove_results(folder)
-        target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps")
+        moved = odometry_words(odometry)
+        target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps; odometry: {moved}")
         localizer.warm_up()
         with ProgressDisplay(target) as display:
             try:
@@ -138,6 +148,7 @@ def _replay(arguments: argparse.Namespace) -> int:
                     every=arguments.every,
                     imu_topic=arguments.imu_topic,
                     imu_time_constant_s=config.imu_time_constant_s,
+                    odometry=odometry,
                     progress=lambda done, total, _: display("localize", done, total, "scans"),
                 )
             except BagError as error:
@@ -153,6 +164,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     facts = {
         "bag": str(arguments.bag),
         "topic": topic,
+        "odometry": moved,
         "map": config.map,
         "weights": encoder.fingerprint[:12],
         "run": "straight through the localizer",
@@ -175,6 +187,41 @@ def choose_cloud_topic(bag: BagReader, chosen: str | None) -> str:
     if chosen is not None:
         return bag.topic(chosen, POINT_CLOUD).name
     return bag.only_topic(POINT_CLOUD, "choose one with --topic").name
+
+
+def choose_odometry(
+    bag: BagReader, chosen: str | None, config: LocalizerNodeConfig, *, asked_for: bool = False
+) -> OdometrySource | None:
+    """Return what tells how the robot moved, as `config.odometry` wants it; None where nothing does.
+
+    `chosen` is a topic. Without one, the only topic that is not called ground truth, or `/odom` among several. A
+    recording without any is localized without odometry, unless a topic was `asked_for`: then BagError lists what there
+    is, as it does where several topics leave the choice open.
+    """
+    if chosen is not None and asked_for and config.odometry != "topic":
+        raise ConfigError(f"--odom-topic has no meaning with --odometry {config.odometry}")
+    if chosen is None and config.odometry == "none":
+        return None
+    if chosen is None and config.odometry == "scan":
+        return OdometrySource(None, config.base_frame_id)
+    if chosen is not None:
+        return OdometrySource(bag.topic(chosen, ODOMETRY).name, config.base_frame_id)
+    names = [t.name for t in bag.topics().values() if t.msgtype == ODOMETRY and "truth" not in t.name]
+    if not names:
+        if asked_for:
+            bag.only_topic(ODOMETRY, "choose one with --odom-topic")
+            raise BagError(f"{bag.path} has no odometry beside ground truth; --odom-topic takes that too")
+        return None
+    if len(names) > 1 and "/odom" not in names:
+        raise BagError(f"{bag.path} has several odometry topics ({', '.join(names)}); choose one with --odom-topic")
+    return OdometrySource("/odom" if len(names) > 1 else names[0], config.base_frame_id)
+
+
+def odometry_words(odometry: OdometrySource | None) -> str:
+    """Return for people what tells how the robot moved."""
+    if odometry is None:
+        return "none (--odometry scan makes one from the scans)"
+    return odometry.topic or "from scan to scan, KISS-ICP"
 
 
 def remove_results(folder: Path) -> None:
