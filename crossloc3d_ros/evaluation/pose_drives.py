@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from crossloc3d_ros.evaluation.pose_sets import (
     PoseSet,
     Progress,
     SimulatedPoses,
+    how_made,
     is_made,
     mark_made,
     placed_town,
@@ -52,7 +54,7 @@ from crossloc3d_ros.types import Float64Array, Int64Array
 VERSION = 1
 _START_NS = 1_700_000_000_000_000_000
 _SAMPLE_NS = 20_000_000
-ODOMETRY = "odometry.npz"
+DRIVES, ODOMETRY = "drives", "odometry.npz"
 CARRIED_NS = 10_000_000_000
 """How long it takes to carry a robot away."""
 _IMU_TIME_CONSTANT_S = 1.0
@@ -172,7 +174,7 @@ def open_drives(
     """
     report = progress or (lambda stage, done, total, unit: None)
     plans, chosen = drive_plans(pose_set.name), POSE_SETS[pose_set.name]
-    tasks = [_Task(pose_set.folder / "drives" / f"{i:02d}", chosen, plan, surveys) for i, plan in enumerate(plans)]
+    tasks = [_Task(pose_set.folder / DRIVES / f"{i:02d}", chosen, plan, surveys) for i, plan in enumerate(plans)]
     if isinstance(chosen, AmsterdamBenchmark) and surveys is None and not all(map(_is_recorded, tasks)):
         raise EvaluationError(f"the drives of '{pose_set.name}' need the folder of its two surveys")
     with benchmark.alone(pose_set.folder):
@@ -187,7 +189,7 @@ def open_drives(
         if missing:
             advance(0)
             benchmark.without_encoder(_record, missing, workers, pose_set.folder, advance)
-    return [_load(task) for task in tasks]
+    return [_load(task.folder) for task in tasks]
 
 
 def journeys_of(pose_set: PoseSet, drives: Sequence[RawDrive]) -> list[Journey]:
@@ -327,9 +329,15 @@ def _record(task: _Task, advance: Callable[[int], None] | None) -> None:
         advance(1)
 
 
-def _load(task: _Task) -> RawDrive:
+def load_drives(folder: Path) -> list[RawDrive]:
+    """Read the drives that lie in a set's folder; EvaluationError where one is damaged."""
+    return [_load(path.parent) for path in sorted((folder / DRIVES).glob(f"*/{ODOMETRY}"))]
+
+
+def _load(folder: Path) -> RawDrive:
     try:
-        with np.load(task.folder / ODOMETRY, allow_pickle=False) as file:
-            return RawDrive(task.plan, load_scans(task.folder), file["stamps_ns"], file["odometry"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise EvaluationError(f"{task.folder} is damaged ({error}); delete it and make it anew") from error
+        plan = DrivePlan(**how_made(folder)["plan"])
+        with np.load(folder / ODOMETRY, allow_pickle=False) as file:
+            return RawDrive(plan, load_scans(folder), file["stamps_ns"], file["odometry"])
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise EvaluationError(f"{folder} is damaged ({error}); delete it and make it anew") from error

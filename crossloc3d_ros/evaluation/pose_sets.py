@@ -413,13 +413,18 @@ def mark_made(folder: Path, settings: dict[str, Any]) -> None:
     (folder / _MADE).write_text(json.dumps(settings), encoding="utf-8")
 
 
+def how_made(folder: Path) -> dict[str, Any]:
+    """Return what `mark_made` has written; empty where the folder is not whole."""
+    try:
+        made = json.loads((folder / _MADE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return dict(made)
+
+
 def is_made(folder: Path, settings: dict[str, Any]) -> bool:
     """Say whether a folder is whole and was made in this way."""
-    try:
-        made: object = json.loads((folder / _MADE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return made == settings
+    return how_made(folder) == settings
 
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

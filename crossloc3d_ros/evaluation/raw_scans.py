@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,5 +157,5 @@ def load_scans(folder: Path) -> RawScans:
         raise EvaluationError(
             f"{folder} is incomplete: {Path(error.filename).name} is missing; make it anew"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise EvaluationError(f"{folder} is damaged ({error}); make it anew") from error
