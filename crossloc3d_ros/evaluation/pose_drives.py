@@ -27,6 +27,7 @@ from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.evaluation import amsterdam, benchmark
 from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
 from crossloc3d_ros.evaluation.pose_sets import (
+    AWAY,
     POSE_SETS,
     PoseSet,
     Progress,
@@ -105,7 +106,9 @@ class Leg:
     drive: int
     """Row of the drives."""
     from_m: float = 0.0
-    """Where on the drive the stretch begins, metres from its first scan; it goes on to the drive's end."""
+    """Where on the drive the stretch begins, metres from its first scan."""
+    to_m: float = math.inf
+    """And where it ends."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,8 @@ def drive_plans(name: str) -> tuple[DrivePlan, ...]:
             chosen.scan.mounting.z_m, 25.0, chosen.clearance_m,
         )  # fmt: skip
         others = (DrivePlan(f"drive {i}", 0, 250.0, 2.5, 5, 970_000 + i, i % 2 == 0, 1.2, 40.0) for i in range(1, 5))
-        return (demo, *others)
+        away = DrivePlan(f"{AWAY.name} (off the map)", 1, 600.0, 1.0, 20, AWAY.seed, False, 1.2, 0.0)
+        return (demo, *others, away)
     heights = np.random.default_rng([chosen.examined.towns[0].seed, 9]).uniform(*chosen.examined.sensor_height_m, 99)
     small = name == "simulated_small"
     length_m = 90.0 if small else 120.0 if name == "fitting" else 180.0
@@ -196,7 +200,8 @@ def journeys_of(pose_set: PoseSet, drives: Sequence[RawDrive]) -> list[Journey]:
     """Return how the drives are examined.
 
     Each drive from nothing to its end; from there the robot is carried to the latter two thirds of another town's
-    drive. The long drive of the demo and those off the map stand for themselves.
+    drive. Those off the map stand for themselves. The long drive of the demo is examined as a whole, and with new
+    starts each hundred metres.
     """
     on_map = [i for i, drive in enumerate(drives) if pose_set.on_map[drive.plan.area]]
     longest = max((drives[i].plan.length_m for i in on_map), default=0.0)
@@ -210,6 +215,9 @@ def journeys_of(pose_set: PoseSet, drives: Sequence[RawDrive]) -> list[Journey]:
             other = shorter[(shorter.index(i) + step) % len(shorter)]
             legs.append(Leg(other, drives[other].plan.length_m / 3.0))
         journeys.append(Journey(tuple(legs)))
+        if i in on_map and i not in shorter:
+            starts = np.arange(100.0, drives[i].plan.length_m - 50.0, 100.0)
+            journeys += [Journey((Leg(i, start, start + 100.0),)) for start in starts.tolist()]
     return journeys
 
 
@@ -220,7 +228,7 @@ def steps_of(journey: Journey, drives: Sequence[RawDrive]) -> list[JourneyStep]:
     for number, leg in enumerate(journey.legs):
         drive_ = drives[leg.drive]
         travelled = drive_.travelled_m
-        rows = np.flatnonzero(travelled >= leg.from_m)
+        rows = np.flatnonzero((travelled >= leg.from_m) & (travelled < leg.to_m))
         if not len(rows):
             continue
         at = int(np.searchsorted(drive_.odometry_ns, drive_.scans.stamp_ns[rows[0]] - _SAMPLE_NS))
@@ -281,6 +289,8 @@ def _is_recorded(task: _Task) -> bool:
 def _world_of(task: _Task) -> World:
     chosen, plan = task.chosen, task.plan
     if isinstance(chosen, AmsterdamBenchmark):
+        if plan.area > 0:
+            return placed_town(AWAY, 1 - AWAY.seed % 2, 600.0, None)[0]
         if task.surveys is None:
             raise EvaluationError("the drives of Amsterdam need the folder of its two surveys")
         return world_from_survey([task.surveys / amsterdam.DRIVE_SURVEY], seed=chosen.drive_seed)

@@ -40,7 +40,10 @@ CANDIDATES, ALIGNED = 25, 25
 """How many of each scan's candidates and aligned poses are kept."""
 STATES = tuple(TrackState)
 SINGLE = -1
-"""The journey of a scan that was asked alone."""
+"""The journey of a scan of the set, asked from nothing."""
+_ALONE = -2
+"""Scans of journey j that were asked again from nothing are of the journey `_ALONE - j`."""
+_ALONE_EVERY = 5
 _SINGLES_AT_ONCE = 16
 
 
@@ -86,7 +89,7 @@ class PosePredictions:
     """One row a scan; angles are counter-clockwise from grid east, metres and radians, NaN where unknown."""
 
     journey: Int64Array
-    """(N,) number of the journey; `SINGLE` for scans asked alone, from nothing."""
+    """(N,) number of the journey; `SINGLE` for the set's scans, asked from nothing; less: see `number_of_alone`."""
     leg: Int64Array
     """(N,) number of the journey's leg: before each but the first the robot was carried away."""
     area: Int64Array
@@ -252,7 +255,17 @@ def predict_journey(
         rows.append(_row(scan, estimate, frame, number, step.leg, step.travelled_m))
         before_ns = step.stamp_ns
         advance(1)
+    # Some of them again, alone: what a scan tells by itself, against what the way until there tells.
+    for step in [step for step in steps_of(journey, drives) if step.leg == 0][::_ALONE_EVERY]:
+        localizer.reset()
+        scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
+        rows.append(_row(scan, _ask(localizer, scan, None), frame, _ALONE - number, 0, step.travelled_m))
     return join(rows)
+
+
+def number_of_alone(predictions: PosePredictions) -> Int64Array:
+    """Return (N,) of which journey a scan is that was asked again from nothing; negative for all others."""
+    return _ALONE - predictions.journey
 
 
 def _ask(localizer: PoseLocalizer, scan: RawScan, motion: Motion | None) -> Estimate:

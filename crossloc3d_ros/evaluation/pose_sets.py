@@ -115,6 +115,9 @@ _MAPPED = _some_of(
     }
 )  # fmt: skip
 
+AWAY = _town("canal_town", 900_063)
+"""The town that the robot is in when it is not in Amsterdam: of all families the most alike."""
+
 POSE_SETS: dict[str, SimulatedPoses | AmsterdamBenchmark] = {
     "simulated": SimulatedPoses(
         SimulatedBenchmark(_MAPPED, town_size_m=600.0, queries=30, ground=0),
@@ -360,9 +363,9 @@ def _make_amsterdam(
             {
                 "name": name,
                 "parts": ["scans"],
-                "areas": ["Amsterdam"],
-                "families": ["real old town"],
-                "on_map": [True],
+                "areas": ["Amsterdam", AWAY.name],
+                "families": ["real old town", AWAY.family],
+                "on_map": [True, False],
                 "groups": [amsterdam.DRIVE, amsterdam.SPREAD],
                 "settings": settings,
             },

@@ -203,10 +203,15 @@ def chance_curve(within: Int64Array, database: int, ranks: int) -> Float64Array:
 
 def clusters_of(queries: PlaceSet) -> Int64Array:
     """Return (Q,) which independent piece of evidence each query belongs to: its area, or a square of 50 m in it."""
-    areas = np.unique(queries.area)
+    return clusters_among(queries.area, queries.xy_m)
+
+
+def clusters_among(area: Int64Array, xy_m: Float64Array) -> Int64Array:
+    """Return the same (Q,) of areas (Q,) and positions (Q, 2)."""
+    areas = np.unique(area)
     if len(areas) >= _LEAST_CLUSTERS:
-        return np.searchsorted(areas, queries.area).astype(np.int64)
-    squares = np.column_stack([queries.area, np.floor(queries.xy_m / _BLOCK_M).astype(np.int64)])
+        return np.searchsorted(areas, area).astype(np.int64)
+    squares = np.column_stack([area, np.floor(xy_m / _BLOCK_M).astype(np.int64)])
     return np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
@@ -248,13 +253,13 @@ def _bootstrap(values: Float64Array, clusters: Int64Array) -> tuple[float, float
     """Return the percentiles 2.5 and 97.5 of the mean of values (Q,) when whole clusters (Q,) are drawn by lot."""
     numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
     sums, counts = np.bincount(numbers, values), np.bincount(numbers)
-    drawn = _draws(len(sums))
+    drawn = bootstrap_draws(len(sums))
     low, high = np.percentile((drawn @ sums) / (drawn @ counts), [2.5, 97.5])
     return float(low), float(high)
 
 
 @functools.lru_cache(maxsize=16)
-def _draws(count: int) -> Float64Array:
+def bootstrap_draws(count: int) -> Float64Array:
     """Return (resamplings, count) how often each of `count` clusters is drawn; always the same."""
     drawn = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1.0 / count), _RESAMPLED)
     return np.asarray(drawn, dtype=np.float64)
