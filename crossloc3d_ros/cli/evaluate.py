@@ -1,4 +1,4 @@
-"""`evaluate`: measure weights by the paper's protocol, on a fixed benchmark or on a dataset of one's own."""
+"""`evaluate`: measure weights by the paper's protocol, or poses by our own, on a fixed benchmark or one's own data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import yaml
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -17,13 +19,23 @@ from rich.table import Table
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.cli.replay import own_version
+from crossloc3d_ros.config import LocalizerConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError, EvaluationError
+from crossloc3d_ros.evaluation import pose_results
 from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
 from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, describe_briefly, write_page
 from crossloc3d_ros.evaluation.encoding import EncodingJob
 from crossloc3d_ros.evaluation.estimates import write_atomically
 from crossloc3d_ros.evaluation.gallery import gallery
+from crossloc3d_ros.evaluation.pose_drives import journeys_of, open_drives
+from crossloc3d_ros.evaluation.pose_page import write_pose_page
+from crossloc3d_ros.evaluation.pose_predictions import about_of
+from crossloc3d_ros.evaluation.pose_predictions import load_predictions as load_pose_predictions
+from crossloc3d_ros.evaluation.pose_predictions import predict as predict_poses
+from crossloc3d_ros.evaluation.pose_predictions import save_predictions as save_pose_predictions
+from crossloc3d_ros.evaluation.pose_scores import PoseScores, score_poses
+from crossloc3d_ros.evaluation.pose_sets import POSE_SETS, open_pose_set
 from crossloc3d_ros.evaluation.predictions import (
     HEADING_MODES,
     SETTINGS,
@@ -39,16 +51,18 @@ from crossloc3d_ros.evaluation.results import as_csv, as_json, headline
 from crossloc3d_ros.evaluation.scan_context import ScanContext
 from crossloc3d_ros.evaluation.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
 from crossloc3d_ros.evaluation.sets import EvaluationSet
+from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.places.workers import EncoderLoader
 from crossloc3d_ros.types import DescriptorEncoder
 
 PAGE, CSV, JSON, PREDICTIONS = "index.html", "results.csv", "results.json", "predictions"
+POSE_PREDICTIONS, MARKDOWN = "predictions.npz", "table.md"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
     arguments = _parser().parse_args(argv)
-    return run(lambda: _evaluate(arguments))
+    return run(lambda: _evaluate_poses(arguments) if arguments.protocol == "pose" else _evaluate(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -56,15 +70,23 @@ def _parser() -> argparse.ArgumentParser:
         prog="evaluate",
         description="Ask weights for the places of ground scans in a database of aerial submaps, write what they "
         "answer, and score it: recall at 100, 50 and 25 m with chance and interval, curves, pictures, one HTML page. "
-        "A run that was stopped goes on where it was.",
+        "With --protocol pose, ask the whole localizer for poses, of single scans and along drives. A run that was "
+        "stopped goes on where it was.",
     )
+    parser.add_argument(
+        "--protocol", choices=["place", "pose"], default="place",
+        help="place: recall of submaps; pose: metres, degrees, fixes and their covariance (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
     parser.add_argument(
         "--method", choices=["weights", "scan_context"], default="weights",
         help="scan_context: polar height maps, without learning, in place of weights (default: %(default)s)",
     )  # fmt: skip
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--benchmark", choices=list(BENCHMARKS), default="simulated", help="(default: %(default)s)")
+    source.add_argument(
+        "--benchmark", choices=list(dict.fromkeys([*BENCHMARKS, *POSE_SETS])), default="simulated",
+        help="fitting: for poses alone, towns to tune settings on (default: %(default)s)",
+    )  # fmt: skip
     source.add_argument("--dataset", type=Path, help="folder in the layout of CS-Campus3D, as make_dataset writes it")
     parser.add_argument(
         "--preset", choices=["campus", "oxford", "plain"], help="kind of --dataset (default: by its files)"
@@ -81,7 +103,11 @@ def _parser() -> argparse.ArgumentParser:
         help="try each query of unknown heading in so many headings; several numbers are compared (default: as many "
         "as the weights were trained for)",
     )  # fmt: skip
-    parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE",
+        help="with --protocol pose: another setting of the localizer, such as fusion.min_probability=0.99",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK or pose_BENCHMARK)")
     parser.add_argument(
         "--data", type=Path, default=Path("out/benchmark"),
         help="folder in which benchmarks and descriptors are kept (default: %(default)s)",
@@ -101,6 +127,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     set_up_logging(arguments.verbose, target)
     if arguments.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    if arguments.set:
+        raise ConfigError("--set changes the localizer, which --protocol place does not ask: add --protocol pose")
     loader = _loader(arguments)
     encoder = loader()
     with ProgressDisplay(target) as display:
@@ -123,6 +151,104 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     print(f"{output / CSV}\n{output / JSON}\n{output / PAGE}   (open it in a browser)")
 
 
+def _evaluate_poses(arguments: argparse.Namespace) -> None:
+    target = console()
+    set_up_logging(arguments.verbose, target)
+    _check_pose_options(arguments)
+    config = from_dict(LocalizerConfig, read_settings(arguments.set))
+    output: Path = arguments.output or Path("out/evaluate") / f"pose_{arguments.benchmark}"
+    if not arguments.only_score:
+        with ProgressDisplay(target) as display:
+            _predict_poses(arguments, config, output / POSE_PREDICTIONS, display)
+    predictions, about = load_pose_predictions(output / POSE_PREDICTIONS)
+    scores = score_poses(predictions, about)
+    write_atomically(output / CSV, pose_results.as_csv(scores))
+    write_atomically(output / JSON, pose_results.as_json(scores))
+    write_atomically(output / MARKDOWN, pose_results.as_markdown(scores))
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    facts = {
+        "map": f"{about.map_km2:.2f} km², {about.submaps:,} submaps",
+        "scans": f"{len(predictions):,} in {len(about.area_names)} areas",
+        "weights": f"{about.weights} ({about.encoder[:12]})",
+        "data": about.data,
+    }
+    words = _AMSTERDAM_WORDS[:1] if about.pose_set == "amsterdam" else _SIMULATED_WORDS
+    write_pose_page(
+        output / PAGE, scores, f"Poses, {about.pose_set}: {about.weights}", facts, words,
+        f"Written by crossloc3d_ros {own_version()} on {today}.",
+    )  # fmt: skip
+    results = Console(highlight=False)
+    for table in pose_tables(scores):
+        results.print(table)
+    print("\n".join(str(output / name) for name in (CSV, JSON, MARKDOWN)))
+    print(f"{output / PAGE}   (open it in a browser)")
+
+
+def _check_pose_options(arguments: argparse.Namespace) -> None:
+    if arguments.workers < 1:
+        raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    if arguments.dataset is not None or arguments.method != "weights" or arguments.setting or arguments.query_headings:
+        raise ConfigError("--protocol pose knows neither --dataset, --method, --setting nor --query-headings")
+
+
+def _predict_poses(
+    arguments: argparse.Namespace, config: LocalizerConfig, path: Path, display: ProgressDisplay
+) -> None:
+    loader = _loader(arguments)
+    surveys = find_surveys(arguments.surveys) if arguments.benchmark == "amsterdam" else None
+    pose_set = open_pose_set(
+        arguments.benchmark, arguments.data, loader, workers=arguments.workers, surveys=surveys, progress=display
+    )
+    drives = open_drives(pose_set, workers=arguments.workers, surveys=surveys, progress=display)
+    journeys = journeys_of(pose_set, drives)
+    predictions = predict_poses(pose_set, drives, journeys, loader, config, workers=arguments.workers, progress=display)
+    about = about_of(pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config)
+    save_pose_predictions(path, predictions, about)
+
+
+def read_settings(texts: Sequence[str]) -> dict[str, Any]:
+    """Return settings given as `group.name=value` as nested groups; ConfigError where one is not of that form."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"--set takes NAME=VALUE, such as fusion.min_probability=0.99, got '{text}'")
+        *groups, last = name.split(".")
+        place = settings
+        for group in groups:
+            place = place.setdefault(group, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"--set {text}: '{group}' was given a value before")
+        try:
+            place[last] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {text}: cannot read the value") from error
+    return settings
+
+
+def pose_tables(scores: PoseScores) -> list[Table]:
+    """Return what the terminal shows of poses: the table of goals, and what each stage brings."""
+    marks = {"goal": "goal", "floor": "floor", "below": "below", "": ""}
+    table = _table(f"Poses, {scores.about.pose_set}", ["", "measured", "95 %", "floor", "goal", "", "of"])
+    for each in scores.measures:
+        floor = pose_results.wanted(each, each.floor, each.floor_high)
+        goal = pose_results.wanted(each, each.goal, each.goal_high)
+        table.add_row(
+            each.text, pose_results.shown(each), pose_results.interval_of(each), floor, goal, marks[each.verdict],
+            f"{each.count:,}",
+        )  # fmt: skip
+    shown = [table]
+    for title, stages in (("Single scans", scores.stages), ("Scans along drives", scores.drive_stages)):
+        part = _table(title, ["", "scans", "2 m and 5°, %", "10 m", "50 m", "median, m"])
+        for stage in stages:
+            middle = f"{stage.median_m:.1f}" if math.isfinite(stage.median_m) else "–"
+            part.add_row(stage.name, f"{stage.scans:,}", _percent(stage.within), _percent(stage.within_10_m),
+                         _percent(stage.within_50_m), middle)  # fmt: skip
+        if stages:
+            shown.append(part)
+    return shown
+
+
 def _loader(arguments: argparse.Namespace) -> EncoderLoader:
     """Return what loads the method, in other processes too; there one thread each is best."""
     if arguments.method == "scan_context":
@@ -136,6 +262,8 @@ def _loader(arguments: argparse.Namespace) -> EncoderLoader:
 def _open(arguments: argparse.Namespace, encoder: DescriptorEncoder, display: ProgressDisplay) -> EvaluationSet:
     if arguments.dataset is not None:
         return load_evaluation_set(arguments.dataset, encoder.preprocessing, arguments.preset)
+    if arguments.benchmark not in BENCHMARKS:
+        raise ConfigError(f"the benchmark '{arguments.benchmark}' is one of poses: add --protocol pose")
     surveys = find_surveys(arguments.surveys) if arguments.benchmark == "amsterdam" else None
     return open_benchmark(
         arguments.benchmark,
