@@ -23,6 +23,7 @@ import numpy as np
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import (
+    EXHAUSTIVE,
     AlignedPoses,
     BoolArray,
     Estimate,
@@ -157,6 +158,8 @@ class EstimateTable:
     heading_std_rad: Float64Array
     """(S,)"""
     aligned: PoseLists
+    aligned_sources: Int64Array
+    """(S, K) as `AlignedPoses.source`: rows of the candidates, below 0 where the search began at a hypothesis."""
     hypotheses: PoseLists
     reasons: tuple[str, ...]
     """(S,)"""
@@ -178,6 +181,19 @@ class EstimateTable:
     def latency_ms(self) -> Float64Array:
         """From scan to estimate altogether (S,), NaN where not measured."""
         return np.asarray(self.timings_ms[:, -1])
+
+    @property
+    def first_aligned(self) -> tuple[Float64Array, Float64Array]:
+        """Return what each scan alone has to say: easting and northing (S, 2) and heading from grid east (S,), or NaN.
+
+        The likeliest aligned pose whose search did not begin at a hypothesis, which earlier scans have led to.
+        """
+        grid, heading = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
+        alone = (self.aligned_sources >= 0) | (self.aligned_sources == EXHAUSTIVE)
+        for scan in np.flatnonzero(alone.any(axis=1)):
+            first = int(alone[scan].argmax())
+            grid[scan], heading[scan] = self.aligned.grid[scan, first], self.aligned.heading_rad[scan, first]
+        return grid, heading
 
     @property
     def has_track(self) -> bool:
@@ -431,7 +447,8 @@ def _table(rows: Sequence[dict[str, str]]) -> EstimateTable:
         probability=_columns(rows, ("probability",))[:, 0],
         heading_rad=np.radians(_columns(rows, ("heading_deg",))[:, 0]),
         heading_std_rad=np.radians(_columns(rows, ("heading_std_deg",))[:, 0]),
-        aligned=_pose_lists(rows, _ALIGNED),
+        aligned=(aligned := _pose_lists(rows, _ALIGNED)),
+        aligned_sources=_sources(rows, aligned.heading_rad.shape[1]),
         hypotheses=_pose_lists(rows, _HYPOTHESIS),
         reasons=tuple(row["reason"] for row in rows),
     )
@@ -478,6 +495,15 @@ def _pose_lists(rows: Sequence[dict[str, str]], prefix: str) -> PoseLists:
         heading_std_rad=np.radians(std_deg),
         probabilities=probabilities,
     )
+
+
+def _sources(rows: Sequence[dict[str, str]], width: int) -> Int64Array:
+    """Return where the search for each aligned pose began; the least number there is where there is no pose."""
+    sources = np.full((len(rows), width), np.iinfo(np.int64).min)
+    for i, row in enumerate(rows):
+        found = (row.get("aligned_sources") or "").split()
+        sources[i, : len(found)] = [int(source) for source in found]
+    return sources
 
 
 def _pose_properties(table: EstimateTable, scan: int) -> dict[str, Any]:

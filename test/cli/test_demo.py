@@ -102,6 +102,7 @@ def test_fixes_stand_beside_the_truth() -> None:
         heading_rad=np.full(count, np.nan),
         heading_std_rad=np.full(count, np.nan),
         aligned=no_pose_lists(count),
+        aligned_sources=np.empty((count, 0), dtype=np.int64),
         hypotheses=no_pose_lists(count),
         reasons=("",) * count,
     )

@@ -16,7 +16,7 @@ from PIL import Image
 
 from crossloc3d_ros.clouds.raster import Raster
 from crossloc3d_ros.errors import CrossLocError
-from crossloc3d_ros.evaluation import backdrop, charts, report
+from crossloc3d_ros.evaluation import backdrop, charts, replay_map, report
 from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
 from crossloc3d_ros.evaluation.replay import Evaluation, score_table
 from crossloc3d_ros.evaluation.truth import TruthTrack
@@ -101,6 +101,7 @@ def made_up_table(
         heading_rad=np.full(scans, np.nan),
         heading_std_rad=np.full(scans, np.nan),
         aligned=no_pose_lists(scans),
+        aligned_sources=np.empty((scans, 0), dtype=np.int64),
         hypotheses=no_pose_lists(scans),
         reasons=tuple(reason or f"reason {i % 3}" for i in range(scans)),
     )
@@ -163,7 +164,7 @@ def test_the_script_gets_every_scan(town_map: AerialMap, tmp_path: Path) -> None
         assert scan["fix"] == bool(table.has_fix[i])
         assert data["reasons"][scan["reason"]] == table.reasons[i]
         np.testing.assert_allclose([west + scan["truth"][0], north - scan["truth"][1]], table.truth_grid[i], atol=0.06)
-        assert len(scan["candidates"]) == report.SHOWN_CANDIDATES
+        assert len(scan["candidates"]) == replay_map.SHOWN_CANDIDATES
         east_m, north_m, distance, probability = np.array(scan["candidates"][2]) * [1, -1, 1, 1] + [west, north, 0, 0]
         np.testing.assert_allclose([east_m, north_m], table.candidate_grid[i, 2], atol=0.06)
         assert (distance, probability) == pytest.approx(
