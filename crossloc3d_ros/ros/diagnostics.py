@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from crossloc3d_ros.ros.conversions import stamp_message
+from crossloc3d_ros.ros.conversions import stamp_message, state_values
 from crossloc3d_ros.types import Estimate, FixStatus
 
 WINDOW = 300
@@ -105,8 +105,13 @@ class Statistics:
             )
 
 
-def judge_health(snapshot: Snapshot, topic: str, publishers: int, complaint: str) -> tuple[bytes, str]:
-    """Return level and message of an active localizer; `complaint` is what the middleware found wrong, or empty."""
+def judge_health(
+    snapshot: Snapshot, topic: str, publishers: int, complaint: str, odometry: str = ""
+) -> tuple[bytes, str]:
+    """Return level and message of an active localizer.
+
+    `complaint` is what the middleware found wrong, `odometry` what is wrong with that; or empty.
+    """
     if snapshot.silent_s > SILENCE_S:
         if complaint:
             return DiagnosticStatus.ERROR, complaint
@@ -118,12 +123,15 @@ def judge_health(snapshot: Snapshot, topic: str, publishers: int, complaint: str
     if snapshot.last.is_fault:
         return DiagnosticStatus.ERROR, snapshot.last.estimate.reason
     if snapshot.last.estimate.status is FixStatus.NO_FIX:
-        return DiagnosticStatus.WARN, snapshot.last.estimate.reason
+        reasons = (snapshot.last.estimate.reason, odometry)
+        return DiagnosticStatus.WARN, "; ".join(reason for reason in reasons if reason)
     if snapshot.lost > LOST_TOLERATED and snapshot.lost > LOST_SHARE * (snapshot.lost + snapshot.received):
         return DiagnosticStatus.WARN, (
             f"{snapshot.lost} of {snapshot.lost + snapshot.received} clouds on {topic} were lost in transport: give "
             "the publishing process a Fast DDS profile with more shared memory, or make both sides reliable"
         )
+    if odometry:
+        return DiagnosticStatus.WARN, odometry
     return DiagnosticStatus.OK, snapshot.last.estimate.reason
 
 
@@ -143,8 +151,10 @@ def snapshot_values(snapshot: Snapshot) -> dict[str, str]:
         estimate = snapshot.last.estimate
         timings, counts = estimate.timings, estimate.counts
         values["last reason"] = estimate.reason
+        values.update(state_values(estimate))
         values["last steps (ms)"] = (
-            f"prepare {timings.prepare_ms:.1f}, encode {timings.encode_ms:.1f}, search {timings.search_ms:.1f}"
+            f"prepare {timings.prepare_ms:.1f}, encode {timings.encode_ms:.1f}, search {timings.search_ms:.1f}, "
+            f"align {timings.align_ms:.1f}, fuse {timings.fuse_ms:.1f}"
         )
         values["last points"] = (
             f"received {counts.received}, finite {counts.finite}, in range {counts.in_range}, "

@@ -1,4 +1,4 @@
-"""The localizer as a lifecycle node: clouds in, fixes out."""
+"""The localizer as a lifecycle node: clouds and odometry in, fixes out."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ import logging
 import os
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -36,26 +38,45 @@ from sensor_msgs.msg import Imu, NavSatFix, PointCloud2
 from std_srvs.srv import Empty
 from visualization_msgs.msg import MarkerArray
 
+from crossloc3d_ros.clouds.filters import mounting_matrix, transform_points
 from crossloc3d_ros.config import LocalizerNodeConfig
-from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError
+from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError, PoseError
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
+from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.gravity import GravityFilter
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
+from crossloc3d_ros.localization.odometry import Motion, OdometryBuffer, ScanOdometry
+from crossloc3d_ros.localization.tracking import PosePrior
 from crossloc3d_ros.places.store import AerialMap, read_manifest
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,
     candidates_message,
     fix_message,
+    hypotheses_message,
     markers_message,
     origin_message,
     pose_message,
+    stale_message,
+    state_message,
 )
-from crossloc3d_ros.ros.diagnostics import Outcome, Statistics, diagnostic_message, judge_health, snapshot_values
+from crossloc3d_ros.ros.diagnostics import (
+    SILENCE_S,
+    Outcome,
+    Statistics,
+    diagnostic_message,
+    judge_health,
+    snapshot_values,
+)
 from crossloc3d_ros.ros.newest import NewestWorker
+from crossloc3d_ros.ros.odometry_input import OdometryInput, odometry_complaint
 from crossloc3d_ros.ros.parameters import ConfigParameters
-from crossloc3d_ros.ros.transforms import TransformSource
-from crossloc3d_ros.types import Estimate, FixStatus, Float64Array
+from crossloc3d_ros.ros.poses import EARTH_FRAME_ID, heading_prior, initial_pose, stamp_of
+from crossloc3d_ros.ros.transforms import MapTransform, TransformSource
+from crossloc3d_ros.types import Estimate, FixStatus, Float64Array, Scan, TrackState
 
+ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Hears reliable publishers too; deep, because a second of 200 Hz may pile up while this process has no time."""
+COMMAND_QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DIAGNOSTICS_PERIOD_S = 1.0
 REPEAT_REASON_S = 10.0
@@ -63,7 +84,13 @@ SPIN_S = 0.1
 """How long the executor waits at most before the process notices a signal."""
 EXIT_ERROR = 2
 
-SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.")
+TF_ANSWERS_S = 3.0
+"""How long an initial pose waits for TF to explain its frame: a listener that has just begun knows nothing yet."""
+TF_PERIOD_S = 0.1
+SAME_CLOCK_NS = 10_000_000_000
+"""An initial pose whose stamp lies farther from the next cloud's is taken for that cloud: another clock stamped it."""
+HEADING_AGE_NS = 500_000_000
+SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.", "fusion.")
 """Parameters that a running node takes up at once; the others need a new configuration of the node."""
 
 
@@ -88,6 +115,13 @@ class Arrival:
     """Monotonic clock."""
 
 
+class HeadingSample(NamedTuple):
+    """An IMU's message and how its axes lie on the base."""
+
+    message: Imu
+    R_base_imu: Float64Array
+
+
 class LocalizerNode(LifecycleNode):
     """Subscribe to clouds, localize the newest, publish the fix and what led to it."""
 
@@ -99,18 +133,30 @@ class LocalizerNode(LifecycleNode):
         self._configuration = ConfigParameters(
             self,
             LocalizerNodeConfig,
-            topics=(self._points_topic, self.resolve_topic_name("imu")),
+            topics=tuple(map(self.resolve_topic_name, ("points", "imu", "odom", "initialpose"))),
             why_fixed=self._why_fixed,
             on_change=self._take_up_settings,
         )
         self._config = self._configuration.config
         self._localizer: Localizer | None = None
         self._transforms: TransformSource | None = None
+        self._map_transform: MapTransform | None = None
         self._gravity = GravityFilter(self._config.imu_time_constant_s)
+        self._heading: HeadingSample | None = None
+        self._odometry: OdometryInput | None = None
+        self._scan_odometry: ScanOdometry | None = None
+        self._orders: deque[Callable[[Localizer, int], None]] = deque()
+        """What the worker does before the next scan, given its stamp: nobody else touches the hypotheses."""
+        self._localized_ns: int | None = None
+        """Stamp of the scan that the hypotheses stand at; the worker's own."""
+        self._initial_pose = ""
+        self._initial_pose_timer: Any = None
         self._worker = NewestWorker(self._process, "localize")
         self._statistics = Statistics()
         self._complaint = ""
         self._last_status: FixStatus | None = None
+        self._state = TrackState.SEARCHING
+        self._is_stale = False
         self._outputs: dict[str, Any] = {}
         self._inputs: list[Any] = []
         self.failure = ""
@@ -142,6 +188,7 @@ class LocalizerNode(LifecycleNode):
         """Stop listening and let the scan at work end."""
         self._stop_listening()
         self._complaint = ""
+        self._tell_stale("inactive")
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -191,6 +238,17 @@ class LocalizerNode(LifecycleNode):
             if not config.base_frame_id:
                 raise ConfigError("mounting_from_tf needs a base_frame_id")
             self._transforms = TransformSource(self, config.base_frame_id)
+        if config.publish_tf:
+            if config.odometry != "topic":
+                raise ConfigError("publish_tf needs odometry from a topic: it is that frame which it places in the map")
+            self._map_transform = MapTransform(self, config.global_frame_id, round(1e9 * config.tf_tolerance_s))
+        if config.odometry == "topic":
+            on_base = None if self._transforms is None else self._transforms.pose_on_base
+            self._odometry = OdometryInput(
+                OdometryBuffer(config.fusion), config.base_frame_id, config.odometry_wait_s, on_base
+            )
+        elif config.odometry == "scan":
+            self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m)
         self._gravity = GravityFilter(config.imu_time_constant_s)
         self._localizer = localizer = self._load(config)
         self._outputs = {
@@ -198,6 +256,8 @@ class LocalizerNode(LifecycleNode):
             "pose": self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),
             "candidates": self.create_lifecycle_publisher(PoseArray, "~/candidates", 10),
             "candidate_table": self.create_lifecycle_publisher(PointCloud2, "~/candidate_table", 10),
+            "hypotheses": self.create_lifecycle_publisher(PoseArray, "~/hypotheses", 10),
+            "state": self.create_lifecycle_publisher(DiagnosticStatus, "~/state", LATCHED),
             "markers": self.create_lifecycle_publisher(MarkerArray, "~/markers", 1),
         }
         # Not managed: who joins while the node is inactive shall learn of the origin too.
@@ -220,26 +280,34 @@ class LocalizerNode(LifecycleNode):
         # In the worker's own thread, because numerical libraries keep state for each thread.
         self._worker.start(localizer.warm_up)
         self._statistics.reset()
-        self._last_status = None
+        self._forget()
         events = SubscriptionEventCallbacks(
             incompatible_qos=self._on_incompatible_qos, message_lost=self._on_message_lost
         )
-        self._listen(PointCloud2, "points", self._receive, events)
-        if self._config.use_imu:
-            self._listen(Imu, "imu", self._receive_imu)
+        if self._odometry is not None:
+            self._listen(Odometry, "odom", self._receive_odometry, ODOMETRY_QOS)
+        if self._config.use_imu or self._config.use_imu_heading:
+            self._listen(Imu, "imu", self._receive_imu, qos_profile_sensor_data)
+        self._listen(PoseWithCovarianceStamped, "initialpose", self._receive_initial_pose, COMMAND_QOS)
+        self._listen(PointCloud2, "points", self._receive, qos_profile_sensor_data, events)
         self.get_logger().info(f"warm after {time.monotonic() - started:.1f} s; listening on {self._points_topic}")
 
     def _listen(
-        self, kind: type, topic: str, callback: Callable[[Any], None], events: SubscriptionEventCallbacks | None = None
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile,
+        events: SubscriptionEventCallbacks | None = None,
     ) -> None:
-        """Subscribe as sensors publish, or as the user has overridden it."""
+        """Subscribe with `profile`, or as the user has overridden it."""
         options = QoSOverridingOptions.with_default_policies()
         try:
             subscription = self.create_subscription(
                 kind,
                 topic,
                 callback,
-                copy.copy(qos_profile_sensor_data),  # rclpy writes the overrides into the profile that it is given
+                copy.copy(profile),  # rclpy writes the overrides into the profile that it is given
                 qos_overriding_options=options,
                 event_callbacks=events,
             )
@@ -252,6 +320,7 @@ class LocalizerNode(LifecycleNode):
         for subscription in self._inputs:
             self.destroy_subscription(subscription)
         self._inputs = []
+        self._stop_waiting_for_tf()
         ended = self._worker.stop()
         if not ended:
             self.get_logger().error("the scan at work does not end")
@@ -264,9 +333,11 @@ class LocalizerNode(LifecycleNode):
             else:
                 self.destroy_lifecycle_publisher(publisher)
         self._outputs = {}
-        if self._transforms is not None:
-            self._transforms.close()
-        self._transforms = None
+        for tf in (self._transforms, self._map_transform):
+            if tf is not None:
+                tf.close()
+        self._transforms = self._map_transform = None
+        self._odometry = self._scan_odometry = None
         self._localizer = None
 
     # Parameters
@@ -287,10 +358,11 @@ class LocalizerNode(LifecycleNode):
         return "is read when the node is configured: clean the node up first"
 
     def _take_up_settings(self) -> None:
-        """Give the running localizer new settings; the scan at work ends with the old ones."""
+        """Give the running localizer new settings, and no hypotheses; the scan at work ends with the old ones."""
         if self._localizer is not None:
             self._config = self._configuration.config
-            self._localizer = Localizer(self._localizer.aerial_map, self._localizer.encoder, self._config)
+            self._localizer = type(self._localizer)(self._localizer.aerial_map, self._localizer.encoder, self._config)
+            self._forget()
 
     # Input
 
@@ -299,30 +371,125 @@ class LocalizerNode(LifecycleNode):
         if self._worker.offer(Arrival(message, time.monotonic())):
             self._statistics.dropped()
 
+    def _receive_odometry(self, message: Odometry) -> None:
+        if self._odometry is None:
+            return
+        try:
+            self._odometry.take(message)
+        except CrossLocError as error:
+            self.get_logger().warning(f"odometry is not used: {error}", throttle_duration_sec=REPEAT_REASON_S)
+
     def _receive_imu(self, message: Imu) -> None:
         force = message.linear_acceleration
         acceleration = np.array([force.x, force.y, force.z])
-        stamp = message.header.stamp
+        R_base_imu = np.eye(3)
         if self._transforms is not None:
             try:
-                acceleration = self._transforms.pose_on_base(message.header.frame_id)[:3, :3] @ acceleration
-            except CloudError as error:
+                R_base_imu = self._transforms.pose_on_base(message.header.frame_id)[:3, :3]
+            except CrossLocError as error:
                 self.get_logger().warning(f"IMU: {error}", throttle_duration_sec=REPEAT_REASON_S)
                 return
-        if not self._gravity.update(stamp.sec * 1_000_000_000 + stamp.nanosec, acceleration):
+        acceleration = R_base_imu @ acceleration
+        if not self._gravity.update(stamp_of(message), acceleration):
             self.get_logger().warning(
                 f"IMU: acceleration {np.round(acceleration, 2).tolist()} m/s2 is no gravity; sample left out",
                 throttle_duration_sec=REPEAT_REASON_S,
             )
+        elif self._config.use_imu_heading:
+            self._heading = HeadingSample(message, R_base_imu)
+
+    def _receive_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Take up a first guess; TF is asked for as long as it may need, and only about frames that it must explain."""
+        localizer, config = self._localizer, self._config
+        self._stop_waiting_for_tf()
+        if localizer is None:
+            return
+        frame_id = message.header.frame_id
+        if frame_id == config.global_frame_id:
+            self._take_initial_pose(message, np.eye(4))
+        elif frame_id == EARTH_FRAME_ID:
+            self._take_initial_pose(message, np.asarray(np.linalg.inv(localizer.aerial_map.frame.pose_on_earth)))
+        elif not frame_id:
+            self._refuse_initial_pose("it names no frame")
+        else:
+            self._ask_tf(message)
+
+    def _ask_tf(self, message: PoseWithCovarianceStamped) -> None:
+        frame_id, config = message.header.frame_id, self._config
+        try:
+            source = self._transforms = self._transforms or TransformSource(self, config.base_frame_id)
+        except ConfigError:
+            self._refuse_initial_pose(
+                f"it is given in '{frame_id}': without tf2_ros only '{config.global_frame_id}' and "
+                f"'{EARTH_FRAME_ID}' can be explained"
+            )
+            return
+        deadline = time.monotonic() + TF_ANSWERS_S
+
+        def look() -> None:
+            try:
+                T_map_frame = source.pose_in(config.global_frame_id, frame_id)
+            except PoseError as error:
+                if time.monotonic() > deadline:
+                    self._stop_waiting_for_tf()
+                    self._refuse_initial_pose(str(error))
+                return
+            self._stop_waiting_for_tf()
+            self._take_initial_pose(message, T_map_frame)
+
+        self._initial_pose_timer = self.create_timer(TF_PERIOD_S, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _stop_waiting_for_tf(self) -> None:
+        if self._initial_pose_timer is not None:
+            self.destroy_timer(self._initial_pose_timer)
+        self._initial_pose_timer = None
+
+    def _take_initial_pose(self, message: PoseWithCovarianceStamped, T_map_frame: Float64Array) -> None:
+        localizer = self._localizer
+        if localizer is None:
+            return
+        aerial_map = localizer.aerial_map
+        try:
+            prior = initial_pose(message.pose, stamp_of(message), T_map_frame, aerial_map.frame, aerial_map.bounds)
+        except PoseError as error:
+            self._refuse_initial_pose(str(error))
+            return
+
+        def order(localizer: Localizer, stamp_ns: int) -> None:
+            same_clock = abs(prior.stamp_ns - stamp_ns) < SAME_CLOCK_NS
+            localizer.set_prior(prior if same_clock else replace(prior, stamp_ns=0))
+
+        self._orders.append(order)
+        self._initial_pose = f"taken: {_described(prior)}"
+        self.get_logger().info(f"initial pose {self._initial_pose}")
+
+    def _refuse_initial_pose(self, reason: str) -> None:
+        self._initial_pose = f"refused: {reason}"
+        self.get_logger().error(f"initial pose {self._initial_pose}")
 
     def _reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
         """Forget everything that earlier messages left behind."""
         if self._worker.discard():
             self._statistics.dropped()
         self._gravity.reset()
-        self._last_status = None
+        self._forget()
         self.get_logger().info("localizing anew")
         return response
+
+    def _forget(self) -> None:
+        """Let the worker begin anew with its next scan."""
+        self._orders.clear()
+        self._orders.append(self._reset_localizer)
+        self._heading = None
+        self._initial_pose = ""
+        self._last_status = None
+
+    def _reset_localizer(self, localizer: Localizer, stamp_ns: int) -> None:
+        localizer.reset()
+        self._localized_ns = None
+        self._state = TrackState.SEARCHING
+        if self._scan_odometry is not None:
+            self._scan_odometry.reset()
 
     def _on_incompatible_qos(self, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)
@@ -350,40 +517,91 @@ class LocalizerNode(LifecycleNode):
     def _localize(self, message: PointCloud2) -> Outcome:
         """Return what comes of a message; every failure becomes an estimate without a fix, with its reason."""
         localizer = self._localizer
-        stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        stamp_ns = stamp_of(message)
         try:
             if localizer is None:
                 raise CloudError("the node is being cleaned up")
             scan = scan_from_pointcloud2(message)
             T_base_lidar = None if self._transforms is None else self._transforms.pose_on_base(scan.frame_id)
             gravity = self._gravity.up(stamp_ns) if self._config.use_imu else None
-            return Outcome(localizer.localize(scan, gravity, T_base_lidar), is_fault=False)
+            while self._orders:
+                self._orders.popleft()(localizer, stamp_ns)
+            self._guess_heading(localizer, stamp_ns)
+            estimate = localizer.localize(scan, gravity, T_base_lidar, self._motion_to(scan, T_base_lidar))
+            if len(estimate.candidates):
+                self._localized_ns = stamp_ns
+            self._state = estimate.state
+            return Outcome(estimate, is_fault=False)
         except CrossLocError as error:
-            return Outcome(no_estimate(stamp_ns, str(error)), is_fault=True)
+            return self._fault(stamp_ns, str(error))
         except Exception as error:
             logging.getLogger(__name__).exception("localizing failed")
-            return Outcome(no_estimate(stamp_ns, f"{type(error).__name__}: {error}"), is_fault=True)
+            return self._fault(stamp_ns, f"{type(error).__name__}: {error}")
+
+    def _fault(self, stamp_ns: int, reason: str) -> Outcome:
+        """Return what comes of a message that says nothing: no fix, and no other state than before."""
+        return Outcome(replace(no_estimate(stamp_ns, reason), state=self._state), is_fault=True)
+
+    def _motion_to(self, scan: Scan, T_base_lidar: Float64Array | None) -> Motion | None:
+        """Return how the robot moved since the last localized scan, None where nothing tells."""
+        if self._scan_odometry is not None:
+            T = mounting_matrix(self._config.scan.mounting) if T_base_lidar is None else T_base_lidar
+            self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points).astype(np.float64))
+        source = self._odometry or self._scan_odometry
+        return (
+            None if source is None or self._localized_ns is None else source.motion(self._localized_ns, scan.stamp_ns)
+        )
+
+    def _guess_heading(self, localizer: Localizer, stamp_ns: int) -> None:
+        """Hand on what the IMU says of the heading, as long as nothing better is known."""
+        sample, config = self._heading, self._config
+        if sample is None or self._state is TrackState.LOCALIZED:
+            return
+        if abs(stamp_ns - stamp_of(sample.message)) > HEADING_AGE_NS:
+            return
+        std_rad, offset_rad = np.radians([config.imu_heading_std_deg, config.imu_heading_offset_deg])
+        try:
+            prior = heading_prior(
+                sample.message, sample.R_base_imu, localizer.aerial_map.frame, float(std_rad), float(offset_rad)
+            )
+        except PoseError as error:
+            self.get_logger().warning(f"IMU: {error}", throttle_duration_sec=REPEAT_REASON_S)
+            return
+        if prior is None:
+            self.get_logger().warning("IMU: its messages carry no orientation", throttle_duration_sec=REPEAT_REASON_S)
+        else:
+            localizer.set_prior(prior)
 
     def _publish(self, estimate: Estimate) -> None:
         outputs, config, localizer = self._outputs, self._config, self._localizer
         outputs["fix"].publish(fix_message(estimate, config.base_frame_id))
+        outputs["state"].publish(state_message(estimate, self._status_name))
+        self._is_stale = False
         if estimate.status is FixStatus.FIX:
             outputs["pose"].publish(pose_message(estimate, config.global_frame_id))
+            self._publish_transform(estimate)
         if localizer is None:
             return
-        wanted = {name for name, publisher in outputs.items() if publisher.get_subscription_count() > 0}
-        if not wanted & {"candidates", "candidate_table", "markers"}:
+        frame, global_frame_id = localizer.aerial_map.frame, config.global_frame_id
+        makers: dict[str, Callable[[Estimate, MapFrame, str], Any]] = {
+            "hypotheses": hypotheses_message,
+            "candidates": candidates_message,
+            "candidate_table": candidate_table_message,
+            "markers": markers_message,
+        }
+        for name, make in makers.items():
+            if outputs[name].get_subscription_count() > 0:
+                outputs[name].publish(make(estimate, frame, global_frame_id))
+
+    def _publish_transform(self, estimate: Estimate) -> None:
+        """Say where the odometry's frame lies, as long as the odometry knows the robot's pose at the scan's stamp."""
+        if self._map_transform is None or self._odometry is None or estimate.state is not TrackState.LOCALIZED:
             return
-        frame, grid = localizer.aerial_map.frame, estimate.candidates.grid
-        enu: Float64Array = frame.to_enu(grid) if len(grid) else np.empty((0, 3))
-        if "candidates" in wanted:
-            outputs["candidates"].publish(candidates_message(estimate, enu, config.global_frame_id))
-        if "candidate_table" in wanted:
-            latitude, longitude, _ = frame.to_geographic(grid) if len(grid) else (np.empty(0), np.empty(0), None)
-            table = candidate_table_message(estimate, enu, latitude, longitude, config.global_frame_id)
-            outputs["candidate_table"].publish(table)
-        if "markers" in wanted:
-            outputs["markers"].publish(markers_message(estimate, enu, config.global_frame_id))
+        T_odom_base = self._odometry.pose_at(estimate.stamp_ns)
+        if T_odom_base is None or not np.isfinite(estimate.T_map_base).all():
+            return
+        T_map_odom = estimate.T_map_base @ np.linalg.inv(T_odom_base)
+        self._map_transform.send(estimate.stamp_ns, T_map_odom, self._odometry.frame_id)
 
     def _tell(self, outcome: Outcome) -> None:
         """Log the first result, every change between fix and no fix, and now and then why there is no fix."""
@@ -410,7 +628,12 @@ class LocalizerNode(LifecycleNode):
             values["encoder"] = localizer.encoder.fingerprint
         if self._inputs:
             publishers = self.count_publishers(self._points_topic)
-            level, message = judge_health(snapshot, self._points_topic, publishers, self._complaint)
+            complaint = self._odometry_complaint()
+            if self._odometry is not None:
+                values["odometry"] = complaint or f"{self._odometry.state().messages} messages"
+            level, message = judge_health(snapshot, self._points_topic, publishers, self._complaint, complaint)
+            if snapshot.silent_s > SILENCE_S:
+                self._tell_stale(message)
         elif self._complaint:
             level, message = DiagnosticStatus.ERROR, self._complaint
         else:
@@ -420,9 +643,27 @@ class LocalizerNode(LifecycleNode):
             now_ns = self._now_ns(snapshot.last)
             tilt = self._gravity.up(now_ns)
             values["imu"] = "no recent sample" if tilt is None else f"up is {np.round(tilt, 3).tolist()} in base"
-        name = f"{self.get_fully_qualified_name().lstrip('/')}: localization"
+        if self._initial_pose:
+            values["initial pose"] = self._initial_pose
+        name = self._status_name
         stamp_ns = self.get_clock().now().nanoseconds
         self._diagnostics.publish(diagnostic_message(name, stamp_ns, level, message, values))
+
+    @property
+    def _status_name(self) -> str:
+        return f"{self.get_fully_qualified_name().lstrip('/')}: localization"
+
+    def _odometry_complaint(self) -> str:
+        if self._odometry is None:
+            return ""
+        topic = self.resolve_topic_name("odom")
+        return odometry_complaint(self._odometry.state(), topic, self.count_publishers(topic))
+
+    def _tell_stale(self, reason: str) -> None:
+        """Say once on the latched topic that what was said last is no longer fresh."""
+        if not self._is_stale and "state" in self._outputs:
+            self._outputs["state"].publish(stale_message(self._state, reason, self._status_name))
+            self._is_stale = True
 
     def _now_ns(self, last: Outcome | None) -> int:
         """Return the time on the sensors' clock, as far as a scan has told it."""
@@ -456,8 +697,8 @@ class _RosLogHandler(logging.Handler):
             self._log.debug(text)
 
 
-def run_localizer(arguments: Sequence[str]) -> int:
-    """Run the node until it is told to stop, and return the exit code.
+def run_localizer(arguments: Sequence[str], load: Callable[[LocalizerNodeConfig], Localizer] = load_localizer) -> int:
+    """Run the node until it is told to stop, and return the exit code; `load` makes its localizer.
 
     0 after SIGINT or SIGTERM, as ROS 2 launch expects it; 2 where it could not start by itself, which the log
     explains. Raises CrossLocError for arguments and parameters that are wrong.
@@ -477,7 +718,7 @@ def run_localizer(arguments: Sequence[str]) -> int:
         surplus = remove_ros_args(["localizer", *arguments])[1:]
         if surplus:
             raise ConfigError(f"unknown argument '{surplus[0]}'; parameters follow --ros-args, as -p name:=value")
-        node = LocalizerNode()
+        node = LocalizerNode(load)
         handler = _RosLogHandler(node)
         logging.getLogger("crossloc3d_ros").addHandler(handler)
         logging.getLogger("crossloc3d_ros").propagate = False
@@ -505,3 +746,14 @@ def run_localizer(arguments: Sequence[str]) -> int:
 
 def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
+
+
+def _described(prior: PosePrior) -> str:
+    parts = []
+    if prior.grid is not None:
+        std_m = float(np.sqrt(np.trace(prior.covariance[:2, :2]) / 2.0))
+        parts.append(f"{prior.grid[0]:.1f} E, {prior.grid[1]:.1f} N, give or take {std_m:.1f} m")
+    if prior.heading_rad is not None:
+        std_deg = float(np.degrees(np.sqrt(prior.covariance[2, 2])))
+        parts.append(f"heading {np.degrees(prior.heading_rad):.0f} degrees from east, give or take {std_deg:.0f}")
+    return "; ".join(parts)

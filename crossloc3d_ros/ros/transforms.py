@@ -1,4 +1,4 @@
-"""Poses of sensors from TF, where tf2_ros is installed: a ROS distribution has it, the package index has not."""
+"""TF, where tf2_ros is installed: a ROS distribution has it, the package index has not."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.time import Time
 
-from crossloc3d_ros.errors import CloudError, ConfigError
-from crossloc3d_ros.ros.conversions import matrix_from_transform
+from crossloc3d_ros.errors import CloudError, ConfigError, PoseError
+from crossloc3d_ros.ros.conversions import matrix_from_transform, transform_message
 from crossloc3d_ros.types import Float64Array
 
 
 class TransformSource:
-    """Look up poses on the robot."""
+    """Look up poses of frames."""
 
     def __init__(self, node: Node, base_frame_id: str) -> None:
         """Begin to listen to /tf and /tf_static; raises ConfigError where tf2_ros is not installed."""
@@ -33,11 +33,50 @@ class TransformSource:
         """Return `T_base_frame` (4, 4), the latest known; raises CloudError naming the frames where there is none."""
         try:
             # The latest one, not the scan's: a mounting is static, and a scan must not wait for TF.
-            found = self._buffer.lookup_transform(self._base_frame_id, frame_id, Time())
+            return self._latest(self._base_frame_id, frame_id)
         except self._failures as failure:
             raise CloudError(f"TF knows no pose of '{frame_id}' on '{self._base_frame_id}': {failure}") from failure
-        return matrix_from_transform(found.transform)
+
+    def pose_in(self, global_frame_id: str, frame_id: str) -> Float64Array:
+        """Return `T_global_frame` (4, 4), the latest known; raises PoseError naming the frames where there is none."""
+        try:
+            return self._latest(global_frame_id, frame_id)
+        except self._failures as failure:
+            raise PoseError(f"TF knows no pose of '{frame_id}' in '{global_frame_id}': {failure}") from failure
 
     def close(self) -> None:
         """Stop listening."""
         self._listener.unregister()
+
+    def _latest(self, target: str, source: str) -> Float64Array:
+        return matrix_from_transform(self._buffer.lookup_transform(target, source, Time()).transform)
+
+
+class MapTransform:
+    """Tell TF where the odometry's frame lies in the map (REP-105)."""
+
+    def __init__(self, node: Node, global_frame_id: str, tolerance_ns: int) -> None:
+        """Announce /tf; raises ConfigError where tf2_ros is not installed."""
+        try:
+            import tf2_ros
+        except ImportError as error:
+            raise ConfigError(
+                "publish_tf needs tf2_ros, which is not installed: install ros-jazzy-tf2-ros-py, "
+                "or set publish_tf to false and take the pose from ~/pose"
+            ) from error
+        self._global_frame_id = global_frame_id
+        self._tolerance_ns = tolerance_ns
+        self._broadcaster: Any = tf2_ros.TransformBroadcaster(node)
+        self._node = node
+
+    def send(self, stamp_ns: int, T_map_odom: Float64Array, odom_frame_id: str) -> None:
+        """Publish the pose (4, 4) that a scan of that stamp has told.
+
+        It is stamped a little ahead, because it holds until the next one comes and TF does not extrapolate.
+        """
+        message = transform_message(T_map_odom, stamp_ns + self._tolerance_ns, self._global_frame_id, odom_frame_id)
+        self._broadcaster.sendTransform(message)
+
+    def close(self) -> None:
+        """Withdraw from /tf."""
+        self._node.destroy_publisher(self._broadcaster.pub_tf)

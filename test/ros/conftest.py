@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 import os
 import signal
 import socket
@@ -24,13 +26,14 @@ os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
 pytest.importorskip("rclpy")
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import NavSatFix, PointCloud2, PointField
+from sensor_msgs.msg import Imu, NavSatFix, PointCloud2, PointField
 from visualization_msgs.msg import MarkerArray
 
 from crossloc3d_ros.clouds.scan import prepare_scan
@@ -203,14 +206,20 @@ def ros_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> It
             os.environ[name] = value
 
 
+REAL = ("-m", "crossloc3d_ros.cli.localizer")
+STAND_IN = (str(Path(__file__).with_name("standin.py")),)
+
+
 class NodeProcess:
     """`localizer` in a process of its own."""
 
-    def __init__(self, environment: Mapping[str, str], log: Path, arguments: list[str]) -> None:
+    def __init__(
+        self, environment: Mapping[str, str], log: Path, arguments: list[str], program: tuple[str, ...] = REAL
+    ) -> None:
         self.log = log
         with log.open("w") as file:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "crossloc3d_ros.cli.localizer", *arguments],
+                [sys.executable, *program, *arguments],
                 env=dict(environment), stdout=file, stderr=subprocess.STDOUT,
             )  # fmt: skip
 
@@ -246,13 +255,18 @@ def start_node(ros_environment: dict[str, str], tmp_path_factory: pytest.TempPat
     """Start a localizer: parameters by name, further arguments as they are."""
     processes: list[NodeProcess] = []
 
-    def start(parameters: Mapping[str, object], *arguments: str, environment: Mapping[str, str] = {}) -> NodeProcess:
+    def start(
+        parameters: Mapping[str, object],
+        *arguments: str,
+        environment: Mapping[str, str] = {},
+        program: tuple[str, ...] = REAL,
+    ) -> NodeProcess:
         given = []
         for name, value in parameters.items():
             given += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         log = tmp_path_factory.mktemp("node") / "log.txt"
         command = ["--ros-args", *given, *arguments] if given or arguments else []
-        processes.append(NodeProcess({**ros_environment, **environment}, log, command))
+        processes.append(NodeProcess({**ros_environment, **environment}, log, command, program))
         return processes[-1]
 
     yield start
@@ -262,6 +276,12 @@ def start_node(ros_environment: dict[str, str], tmp_path_factory: pytest.TempPat
             process.wait(10.0)
 
 
+@pytest.fixture(scope="session")
+def start_stand_in(start_node: StartNode) -> StartNode:
+    """Start a node whose localizer is the stand-in: places are found, poses made up."""
+    return functools.partial(start_node, program=STAND_IN)
+
+
 @dataclass
 class Robot:
     """The other side: publishes clouds, keeps what comes back."""
@@ -269,19 +289,26 @@ class Robot:
     node: Any
     executor: SingleThreadedExecutor
     clouds: Any
+    odometry: Any
+    imu: Any
+    guesses: Any
     stamps_ns: Iterator[int]
     """Every stamp occurs once in a test run: what an earlier test left latched is no answer to this one."""
     fixes: list[NavSatFix] = field(default_factory=list)
     poses: list[PoseWithCovarianceStamped] = field(default_factory=list)
     candidates: list[PoseArray] = field(default_factory=list)
     tables: list[PointCloud2] = field(default_factory=list)
+    hypotheses: list[PoseArray] = field(default_factory=list)
+    states: list[DiagnosticStatus] = field(default_factory=list)
     markers: list[MarkerArray] = field(default_factory=list)
     origins: list[NavSatFix] = field(default_factory=list)
     diagnostics: list[DiagnosticArray] = field(default_factory=list)
 
     def forget(self) -> None:
         """Drop what has come so far, but for what is latched."""
-        for kept in (self.fixes, self.candidates, self.tables, self.markers, self.diagnostics):
+        for kept in (
+            self.fixes, self.candidates, self.tables, self.hypotheses, self.states, self.markers, self.diagnostics
+        ):  # fmt: skip
             kept.clear()
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 15.0, what: str = "") -> None:
@@ -305,6 +332,13 @@ class Robot:
         """The points as the next cloud of the sensor."""
         return cloud_message(points, next(self.stamps_ns))
 
+    def drive(self, stamp_ns: int, x: float, yaw: float = 0.0, child_frame_id: str = "base_link") -> None:
+        """Publish odometry: the robot stands `x` metres along its way."""
+        message = Odometry(header=header_message(stamp_ns, "odom"), child_frame_id=child_frame_id)
+        message.pose.pose.position.x = float(x)
+        message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+        self.odometry.publish(message)
+
     def localize(self, cloud: PointCloud2 | Array, timeout_s: float = 15.0) -> NavSatFix:
         """Publish a cloud and return the fix with its stamp; a lost cloud is sent again with the same stamp."""
         message = cloud if isinstance(cloud, PointCloud2) else self.message(cloud)
@@ -320,6 +354,22 @@ class Robot:
                         return fix
         raise AssertionError("no fix came back")
 
+    def told(self, message: PointCloud2) -> tuple[int, str, dict[str, str]]:
+        """Level, message and values of the state after the scan; what the stand-in was handed stands in the message."""
+        stamp = message.header.stamp
+        stamp_ns = str(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        self.fixes.clear()  # the scan may be sent for a second time
+        self.states.clear()
+        self.localize(message)
+        found: list[DiagnosticStatus] = []
+
+        def has_come() -> bool:
+            found[:] = [s for s in self.states if any(v.value == stamp_ns for v in s.values)]
+            return bool(found)
+
+        self.wait_until(has_come, what="for the state")
+        return found[-1].level[0], found[-1].message, {v.key: v.value for v in found[-1].values}
+
     def call(self, kind: type, name: str, request: Any, timeout_s: float = FIRST_ANSWER_S) -> Any:
         client = self.node.create_client(kind, name)
         try:
@@ -330,8 +380,15 @@ class Robot:
         finally:
             self.node.destroy_client(client)
 
-    def state(self) -> str:
-        return str(self.call(GetState, "/localizer/get_state", GetState.Request()).current_state.label)
+    def state(self, node: str = "/localizer", timeout_s: float = FIRST_ANSWER_S) -> str:
+        """State of the lifecycle, asked for again where the answer is lost: the service may know us before we do."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                answer = self.call(GetState, f"{node}/get_state", GetState.Request(), 20.0)
+                return str(answer.current_state.label)
+            except AssertionError:
+                assert time.monotonic() < deadline, f"no answer of {node}/get_state"
 
     def change_state(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=int(transition)))
@@ -346,6 +403,15 @@ class Robot:
         )
         status = self.diagnostics[-1].status[0]
         return status.level[0], status.message, {v.key: v.value for v in status.values}
+
+    def diagnosis_with(self, key: str, words: str) -> tuple[int, str, dict[str, str]]:
+        """Level, message and values of the next diagnostics whose value of `key` holds `words`."""
+        deadline = time.monotonic() + 15.0
+        while time.monotonic() < deadline:
+            told = self.diagnosis()
+            if words in told[2].get(key, ""):
+                return told
+        raise AssertionError(f"no diagnostics say '{words}' of '{key}': {told[2]}")
 
 
 @pytest.fixture(scope="session")
@@ -362,11 +428,16 @@ def robot(robot_context: rclpy.Context) -> Iterator[Robot]:
     executor = SingleThreadedExecutor(context=robot_context)
     executor.add_node(node)
     publisher = node.create_publisher(PointCloud2, "points", qos_profile_sensor_data)
-    robot = Robot(node, executor, publisher, STAMPS_NS)
+    odometry = node.create_publisher(Odometry, "odom", 50)
+    imu = node.create_publisher(Imu, "imu", 50)
+    guesses = node.create_publisher(PoseWithCovarianceStamped, "initialpose", 5)
+    robot = Robot(node, executor, publisher, odometry, imu, guesses, STAMPS_NS)
     node.create_subscription(NavSatFix, "/localizer/fix", robot.fixes.append, 50)
     node.create_subscription(PoseWithCovarianceStamped, "/localizer/pose", robot.poses.append, LATCHED)
     node.create_subscription(PoseArray, "/localizer/candidates", robot.candidates.append, 10)
     node.create_subscription(PointCloud2, "/localizer/candidate_table", robot.tables.append, 10)
+    node.create_subscription(PoseArray, "/localizer/hypotheses", robot.hypotheses.append, 10)
+    node.create_subscription(DiagnosticStatus, "/localizer/state", robot.states.append, LATCHED)
     node.create_subscription(MarkerArray, "/localizer/markers", robot.markers.append, 10)
     node.create_subscription(NavSatFix, "/localizer/map_origin", robot.origins.append, LATCHED)
     node.create_subscription(DiagnosticArray, "/diagnostics", robot.diagnostics.append, 10)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shutil
 import signal
@@ -16,17 +17,21 @@ import pytest
 pytest.importorskip("rclpy")
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus, PointCloud2
 from std_srvs.srv import Empty
 
 from crossloc3d_ros.formats.bag import open_bag
+from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.ros.conversions import header_message, in_grid, in_map, matrix_from_transform
 
 if TYPE_CHECKING:
     from conftest import NodeProcess, Robot, StartNode, World
@@ -34,14 +39,16 @@ if TYPE_CHECKING:
 
 TABLE = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("latitude", "<f8"), ("longitude", "<f8"),
-     ("descriptor_distance", "<f4"), ("probability", "<f4"), ("submap_id", "<i4")]
+     ("descriptor_distance", "<f4"), ("probability", "<f4"), ("submap_id", "<i4"),
+     ("aligned_x", "<f4"), ("aligned_y", "<f4"), ("aligned_yaw", "<f4"), ("aligned_probability", "<f4")]
 )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def localizer(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
-    """One node for all tests that leave it as they find it: active, with its own settings."""
-    node = start_node(world.parameters())
+def localizer(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
+    """One node for all tests that leave it as they find it: active, with its own settings, TF and all inputs."""
+    own = {"publish_tf": True, "use_imu_heading": True}
+    node = start_stand_in({**world.parameters(), **own}, environment={"STANDIN_TF2": "1"})
     node.wait_for_output("listening on /points")
     yield node
     assert node.is_alive, f"a test has ended the node:\n{node.output}"
@@ -56,19 +63,33 @@ def active(localizer: NodeProcess, robot: Robot) -> Robot:
     return robot
 
 
+def frame_of(world: World) -> MapFrame:
+    return MapFrame("EPSG:32631", np.array(world.grid(0)), 0.0)
+
+
+def made_up(world: World, place: int) -> np.ndarray:
+    """Grid position (1, 3) of what the stand-in makes up at a place."""
+    return np.array([world.grid(place)]) + np.array([3.0, -2.0, 0.0])
+
+
+def pose_in_map(world: World, place: int) -> tuple[np.ndarray, float]:
+    """Position and yaw in the map of what the stand-in makes up at a place."""
+    enu, yaw = in_map(frame_of(world), made_up(world, place), np.array([0.5]))
+    return enu[0], float(yaw[0])
+
+
 def test_a_cloud_becomes_a_fix_by_every_convention(active: Robot, world: World) -> None:
     message = active.message(world.points(7))
     fix = active.localize(message)
     assert fix.status.status == NavSatStatus.STATUS_FIX
     assert fix.header.stamp == message.header.stamp
     assert fix.header.frame_id == "base_link", "the frame whose position is given, not the map's"
-    latitude, longitude = world.latitude_longitude(7)
-    assert fix.latitude == pytest.approx(latitude, abs=1e-6)
-    assert fix.longitude == pytest.approx(longitude, abs=1e-6)
-    assert fix.altitude == pytest.approx(world.grid(7)[2], abs=0.01)
+    latitude, longitude, altitude = frame_of(world).to_geographic(made_up(world, 7))
+    assert fix.latitude == pytest.approx(latitude[0], abs=1e-8)
+    assert fix.longitude == pytest.approx(longitude[0], abs=1e-8)
+    assert fix.altitude == pytest.approx(altitude[0], abs=0.01)
     assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_APPROXIMATED
-    covariance = np.array(fix.position_covariance).reshape(3, 3)
-    assert np.linalg.eigvalsh(covariance[:2, :2]).min() >= 25.0**2 - 1e-6
+    np.testing.assert_allclose(np.diag(np.array(fix.position_covariance).reshape(3, 3)), [0.04, 0.09, 0.25])
 
 
 def test_the_pose_lies_in_the_map_frame_whose_origin_is_latched(active: Robot, world: World) -> None:
@@ -79,20 +100,20 @@ def test_the_pose_lies_in_the_map_frame_whose_origin_is_latched(active: Robot, w
     active.wait_until(lambda: active.poses and active.poses[-1].header.stamp == fix.header.stamp, what="for the pose")
     pose = active.poses[-1]
     assert pose.header.frame_id == "map"
-    frame = MapFrame("EPSG:32631", np.array(world.grid(0)), 0.0)
+    frame = frame_of(world)
     at_origin = frame.from_geographic(np.array([origin.latitude]), np.array([origin.longitude]))
     np.testing.assert_allclose(at_origin[0, :2], world.grid(0)[:2], atol=1e-3)
-    position = pose.pose.pose.position
-    expected = frame.to_enu(np.array([world.grid(8)]))[0]
-    np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=0.05)
+    T = pose_matrix(pose.pose.pose)
+    position, yaw = pose_in_map(world, 8)
+    np.testing.assert_allclose(T[:3, 3], position, atol=0.001)
+    assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw, abs=1e-6)
     covariance = np.array(pose.pose.covariance).reshape(6, 6)
-    assert covariance[5, 5] > 1e3, "the heading is not known"
-    np.testing.assert_allclose(covariance[:3, :3].ravel(), fix.position_covariance)
+    np.testing.assert_allclose(covariance, np.diag([0.04, 0.09, 0.25, 0.001, 0.002, 0.0001]))
 
 
 def test_the_candidates_come_as_poses_as_a_table_and_as_markers(active: Robot, world: World) -> None:
     fix = active.localize(world.points(9))
-    outputs = (active.candidates, active.tables)
+    outputs = (active.candidates, active.tables, active.hypotheses)
     active.wait_until(lambda: all(o and o[-1].header.stamp == fix.header.stamp for o in outputs), what="for candidates")
     table = active.tables[-1]
     assert [(f.name, f.offset) for f in table.fields] == [(n, TABLE.fields[n][1]) for n in TABLE.names]
@@ -102,12 +123,167 @@ def test_the_candidates_come_as_poses_as_a_table_and_as_markers(active: Robot, w
     assert rows["submap_id"][0] == 9
     assert rows["probability"].sum() == pytest.approx(1.0, abs=0.01)
     assert rows["latitude"][0] == pytest.approx(world.latitude_longitude(9)[0], abs=1e-9)
-    poses = active.candidates[-1]
-    assert poses.header.frame_id == table.header.frame_id == "map"
+    # Two poses fit around the first candidate, of which the likelier is told, none around the last.
+    position, yaw = pose_in_map(world, 9)
+    np.testing.assert_allclose([rows["aligned_x"][0], rows["aligned_y"][0]], position[:2], atol=1e-3)
+    assert rows["aligned_yaw"][0] == pytest.approx(yaw, abs=1e-5)
+    assert rows["aligned_probability"][0] == rows["probability"][0]
+    assert np.isfinite(rows["aligned_yaw"]).tolist() == [True] + [True] * 23 + [False]
+    poses, hypotheses = active.candidates[-1], active.hypotheses[-1]
+    assert poses.header.frame_id == table.header.frame_id == hypotheses.header.frame_id == "map"
     np.testing.assert_allclose([p.position.x for p in poses.poses], rows["x"], atol=1e-3)
+    assert len(hypotheses.poses) == 2
+    T = pose_matrix(hypotheses.poses[0])
+    np.testing.assert_allclose(T[:3, 3], position, atol=1e-3)
+    assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw, abs=1e-6)
     active.wait_until(lambda: active.markers, what="for markers")
-    assert len(active.markers[-1].markers) == 1 + 25 + 2
-    assert any("of 25 candidates lie at one place" in m.text for m in active.markers[-1].markers)
+    assert len(active.markers[-1].markers) == 1 + 25 + 2 + 2
+    assert any("believed 100%" in m.text for m in active.markers[-1].markers)
+
+
+def test_the_state_is_latched_and_says_why(active: Robot, world: World) -> None:
+    level, message, values = active.told(active.message(world.points(10)))
+    assert level == 0
+    assert message.startswith("localized: believed 100%")
+    assert values["fix"] == "yes"
+    assert values["hypotheses"] == "0.9 0.06"
+    assert values["deviation (m, m, deg)"] == "0.20 0.30 0.57"
+    late: list[DiagnosticStatus] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = active.node.create_subscription(DiagnosticStatus, "/localizer/state", late.append, latched)
+    active.wait_until(lambda: late, what="for the latched state")
+    assert late[0].message == message
+    level, message, values = active.told(active.message(np.full((20_000, 3), np.nan)))
+    assert level == 1
+    assert message.startswith("searching: 0 of 20,000 points left")
+    assert values["fix"] == "no"
+    # Who joins in a silence shall not take an old state for the present.
+    active.wait_until(lambda: late[-1].level == DiagnosticStatus.STALE, what="for the state to be stale")
+    assert late[-1].message.startswith("searching when last seen: no cloud on /points for")
+    active.node.destroy_subscription(subscription)
+
+
+def stamp_ns_of(message: Any) -> int:
+    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+
+
+def drive_between(robot: Robot, first: PointCloud2, second: PointCloud2, metres: float, **how: Any) -> None:
+    """Publish odometry at 100 Hz from one scan to the next, and wait until the node has it."""
+    begin_ns, end_ns = stamp_ns_of(first), stamp_ns_of(second)
+    stamps = np.arange(begin_ns, end_ns + 1, 10_000_000)
+    for stamp_ns in stamps:
+        robot.drive(int(stamp_ns), 500.0 + metres * (int(stamp_ns) - begin_ns) / (end_ns - begin_ns), **how)
+    robot.spin(0.1)
+
+
+def test_odometry_reaches_the_localizer_as_the_way_from_scan_to_scan(active: Robot, world: World) -> None:
+    active.call(Empty, "/reinitialize_global_localization", Empty.Request())
+    first, second, third = (active.message(world.points(place)) for place in (11, 12, 13))
+    drive_between(active, first, second, 0.7)
+    assert active.told(first)[1].endswith("no motion")
+    assert active.told(second)[1].endswith("moved 0.70 0.00 0.000")
+    # The same stamp again, and one that comes late: nothing that odometry could tell.
+    assert active.told(second)[1].endswith("moved 0.00 0.00 0.000")
+    assert "unknown motion (time goes backwards" in active.told(first)[1]
+    drive_between(active, second, third, 40.0)
+    assert "unknown motion (the odometry jumps by" in active.told(third)[1]
+
+
+def test_odometry_of_another_frame_is_refused_and_diagnosed(active: Robot, world: World) -> None:
+    for _ in range(10):
+        next(active.stamps_ns)  # a second: too long to go on from what earlier tests have told
+    first, second = (active.message(world.points(place)) for place in (11, 12))
+    drive_between(active, first, second, 0.7, child_frame_id="imu_link")
+    active.localize(first)
+    assert "unknown motion (the odometry has stopped" in active.told(second)[1]
+    level, message, values = active.diagnosis("'imu_link'")
+    assert level == 1
+    assert "odometry on /odom is not used: it is the pose of 'imu_link', not of 'base_link'" in message
+    assert values["odometry"] in message
+
+
+def test_tf_tells_where_the_odometrys_frame_lies_but_only_while_localized(active: Robot, world: World) -> None:
+    told: list[TransformStamped] = []
+    subscription = active.node.create_subscription(TransformStamped, "/tf_told", told.append, 100)
+    active.wait_until(lambda: active.node.count_publishers("/tf_told") > 0, what="for TF")
+    active.spin(0.3)
+    first, second = (active.message(world.points(place)) for place in (14, 15))
+    drive_between(active, first, second, 0.9)
+    # Between two samples of the odometry: its pose is interpolated.
+    scan = active.message(world.points(15))
+    scan.header.stamp = header_message(stamp_ns_of(first) + 55_000_000, "").stamp
+    active.localize(scan)
+    active.wait_until(lambda: told, what="for the transform")
+    transform = told[-1]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+    assert stamp_ns_of(transform) == stamp_ns_of(scan) + 200_000_000
+    T_odom_base = np.eye(4)
+    T_odom_base[0, 3] = 500.0 + 0.9 * 0.55
+    T_map_base = matrix_from_transform(transform.transform) @ T_odom_base
+    position, yaw = pose_in_map(world, 15)
+    np.testing.assert_allclose(T_map_base[:3, 3], position, atol=1e-3)
+    assert math.atan2(T_map_base[1, 0], T_map_base[0, 0]) == pytest.approx(yaw, abs=1e-6)
+    count = len(told)
+    active.localize(spoil(second, "all NaN"))
+    active.spin(0.3)
+    assert len(told) == count
+    active.node.destroy_subscription(subscription)
+
+
+def guess(frame_id: str, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> PoseWithCovarianceStamped:
+    message = PoseWithCovarianceStamped(header=header_message(5_000_000_000, frame_id))
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z = float(x), float(y), float(z)
+    orientation.z, orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    message.pose.covariance = [float(v) for v in np.diag([4.0, 9.0, 1e6, 1e6, 1e6, 0.01]).flat]
+    return message
+
+
+def test_an_initial_pose_reaches_the_localizer_in_the_grid(active: Robot, world: World) -> None:
+    active.guesses.publish(guess("map", 12.0, 15.0, yaw=1.0))
+    _, _, values = active.diagnosis_with("initial pose", "taken")
+    grid, heading = in_grid(frame_of(world), np.array([12.0, 15.0, 0.0]), 1.0)
+    assert f"{grid[0]:.1f} E, {grid[1]:.1f} N" in values["initial pose"]
+    _, message, _ = active.told(active.message(world.points(16)))
+    assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take" in message
+    # TF explains a frame that lies at (100, 50) and is turned by a quarter.
+    active.guesses.publish(guess("odom_far", -40.0, 90.0, yaw=0.5))
+    grid, heading = in_grid(frame_of(world), np.array([10.0, 10.0, 0.0]), 0.5 + math.pi / 2)
+    active.diagnosis_with("initial pose", f"{grid[0]:.1f} E, {grid[1]:.1f} N")
+    _, message, _ = active.told(active.message(world.points(16)))
+    assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take 2.999 2.001 0.100" in message, (
+        "its north is west"
+    )
+
+
+def test_an_initial_pose_that_nothing_explains_is_refused_with_the_reason(active: Robot, world: World) -> None:
+    for message, reason in (
+        (guess("map", 5_000.0, 0.0), "outside of the map"),
+        (guess("", 0.0, 0.0), "names no frame"),
+        (guess("moon", 0.0, 0.0), "TF knows no pose of 'moon' in 'map'"),
+    ):
+        active.guesses.publish(message)
+        active.diagnosis_with("initial pose", reason)
+    assert active.localize(world.points(16)).status.status == NavSatStatus.STATUS_FIX
+
+
+def test_the_imu_tells_the_heading_until_something_better_does(active: Robot, world: World) -> None:
+    active.call(Empty, "/reinitialize_global_localization", Empty.Request())
+    active.localize(active.message(world.points(17)))
+
+    def after(yaw: float) -> str:
+        # Of another place than any, so that the stand-in is not sure.
+        scan = active.message(world.points(999))
+        sample = Imu(header=scan.header)
+        sample.linear_acceleration.z = 9.81
+        sample.orientation.z, sample.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+        active.imu.publish(sample)
+        active.spin(0.2)
+        return active.told(scan)[1]
+
+    _, heading = in_grid(frame_of(world), np.zeros(3), 0.8)
+    assert "prior" not in after(0.8), "it is localized still"
+    assert f"prior at nowhere to {heading:.3f} give or take inf inf {math.radians(15):.3f}" in after(0.8)
 
 
 def spoil(message: PointCloud2, how: str) -> PointCloud2:
@@ -155,7 +331,8 @@ def test_a_bad_cloud_gives_no_fix_a_reason_and_no_harm(
     assert math.isnan(fix.longitude)
     assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN
     told, message, values = active.diagnosis(reason)
-    assert (told, values["last reason"]) == (level, message)
+    assert told == level
+    assert message.startswith(values["last reason"])
     assert not [p for p in active.poses if p.header.stamp == fix.header.stamp], "a pose without a fix"
     assert active.localize(world.points(1)).status.status == NavSatStatus.STATUS_FIX
 
@@ -202,9 +379,18 @@ def test_what_is_dropped_is_counted_and_the_newest_is_worked_on(active: Robot, w
 
 
 def test_the_diagnostics_say_what_the_node_works_with(active: Robot, world: World) -> None:
-    active.localize(world.points(2))
-    level, _, values = active.diagnosis("candidates lie at one place")
-    assert level == 0
+    message = active.message(world.points(2))
+    active.localize(message)
+    stamps = itertools.count(stamp_ns_of(message), 10_000_000)
+
+    def has_no_complaint() -> bool:
+        active.drive(next(stamps), 0.0)
+        return bool(active.diagnostics) and active.diagnostics[-1].status[0].level[0] == 0
+
+    active.wait_until(has_no_complaint, what="for diagnostics without complaint")
+    status = active.diagnostics[-1].status[0]
+    reason, values = status.message, {v.key: v.value for v in status.values}
+    assert reason.startswith("believed 100%")
     assert values["map"] == str(world.map_path)
     assert values["submaps"] == "30"
     assert len(values["encoder"]) == 16
@@ -305,9 +491,9 @@ R_TILT = np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0
 
 
 @pytest.fixture(scope="module")
-def managed(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
+def managed(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
     own = {"autostart": False, "use_sim_time": True, "use_imu": True, "imu_time_constant_s": 0.01}
-    node = start_node(
+    node = start_stand_in(
         {**world.parameters(), **own, "qos_overrides./rover/lidar.subscription.reliability": "reliable"},
         "-r", "__ns:=/rover", "-r", "points:=lidar",
     )  # fmt: skip
@@ -320,17 +506,14 @@ def managed(start_node: StartNode, world: World) -> Iterator[NodeProcess]:
 def test_a_managed_node_in_a_namespace_levels_by_the_imu(
     managed: NodeProcess, robot: Robot, world: World, robot_context: rclpy.Context
 ) -> None:
-    from lifecycle_msgs.srv import ChangeState, GetState
-
-    def state() -> str:
-        return str(robot.call(GetState, "/rover/localizer/get_state", GetState.Request()).current_state.label)
+    from lifecycle_msgs.srv import ChangeState
 
     clock = robot.node.create_publisher(Clock, "/clock", 1)
-    assert state() == "unconfigured"
+    assert robot.state("/rover/localizer") == "unconfigured"
     for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
         request = ChangeState.Request(transition=Transition(id=int(transition)))
         assert robot.call(ChangeState, "/rover/localizer/change_state", request).success, managed.output
-    assert state() == "active"
+    assert robot.state("/rover/localizer") == "active"
 
     tables: list[PointCloud2] = []
     robot.node.create_subscription(PointCloud2, "/rover/localizer/candidate_table", tables.append, 10)
