@@ -41,7 +41,9 @@ from crossloc3d_ros.evaluation.replay import (
     write_summary,
 )
 from crossloc3d_ros.evaluation.report import About, write_report
+from crossloc3d_ros.evaluation.track_scores import TrackScores
 from crossloc3d_ros.evaluation.truth import find_truth_topic
+from crossloc3d_ros.evaluation.wording import degrees, metres, percent
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.places.store import AerialMap
@@ -258,7 +260,9 @@ def print_results(evaluation: Evaluation, target: Console) -> None:
         target.print(figures)
         return
     error, first = scores.fix_error, scores.best_candidate_error
-    if error.count:
+    if evaluation.track is not None:
+        _add_track(figures, evaluation.track)
+    elif error.count:
         figures.add_row("error of a fix", f"median {error.median_m:.0f} m, 95 % {error.p95_m:.0f} m")
         figures.add_row("truth in the 95 % ellipse", f"{error.within_ellipse:.0%} of the fixes")
     if first.count:
@@ -273,6 +277,24 @@ def print_results(evaluation: Evaluation, target: Console) -> None:
         cells = [scores.recall(rank, radius) for radius in RADII_M]
         recall.add_row(f"AR@{rank}", *(f"{cell.share.value:.0%} (by lot {cell.chance:.0%})" for cell in cells))
     target.print(recall)
+
+
+def _add_track(figures: Table, track: TrackScores) -> None:
+    """Add the rows of a pose that was followed."""
+    for search in track.searches:
+        found = f"after {metres(search.travelled_m)} and {search.seconds:.1f} s"
+        figures.add_row(f"localized, {search.cause}", found if search.end is not None else "never")
+    errors = track.errors
+    if errors.count:
+        figures.add_row("error of a fix", f"median {metres(errors.median_m)}, 95 % {metres(errors.p95_m)}")
+        if errors.headings:
+            figures.add_row(
+                "error of its heading", f"median {degrees(errors.median_deg)}, 95 % {degrees(errors.p95_deg)}"
+            )
+        figures.add_row("wrong by more than 10 m", f"{errors.wrong:,} of {errors.count:,} fixes")
+        for row in track.coverage[1:2]:
+            inside = f"{percent(row.position)} of the positions, {percent(row.heading)} of the headings"
+            figures.add_row("errors inside 2 sigma", f"{inside} (should be {percent(row.expected)})")
 
 
 def read_config(

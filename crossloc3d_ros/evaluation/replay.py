@@ -60,7 +60,9 @@ class Evaluation:
     scores: Scores | None
     """None where nothing is known of the truth."""
     track: TrackScores | None = None
-    """None where besides the estimates are places and no poses."""
+    """None where the estimates are places and no poses, or nothing is known of the truth."""
+    heading_topic: str | None = None
+    """What tells the true headings; None where nothing does."""
 
 
 @dataclass(frozen=True)
@@ -230,6 +232,7 @@ def evaluate(bag: BagReader, folder: Path, aerial_map: AerialMap, gnss_topic: st
     truth_topic = find_truth_topic(bag, gnss_topic)
     truth = None if truth_topic is None else read_truth(bag, truth_topic, aerial_map.frame)
     table = read_estimates(path)
+    headings = None
     if truth is not None:
         heading_topic = find_heading_topic(bag)
         headings = None if heading_topic is None else read_heading(bag, heading_topic, truth, aerial_map.frame)
@@ -246,7 +249,13 @@ def evaluate(bag: BagReader, folder: Path, aerial_map: AerialMap, gnss_topic: st
                 len(truth),
                 truth.dropped,
             )
-    evaluation = Evaluation(table, truth, score_table(table, aerial_map), score_track(table))
+    evaluation = Evaluation(
+        table,
+        truth,
+        score_table(table, aerial_map),
+        score_track(table),
+        None if headings is None else headings.topic,
+    )
     write_geojson(folder / GEOJSON, table, aerial_map.frame)
     return evaluation
 

@@ -15,7 +15,7 @@ from crossloc3d_ros.evaluation.replay_charts import STATE_WORDS, WORST, class_of
 from crossloc3d_ros.evaluation.truth import jumped
 from crossloc3d_ros.evaluation.wording import rounded
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.types import Float64Array
+from crossloc3d_ros.types import EXHAUSTIVE, Float64Array
 
 SHOWN_CANDIDATES = 10
 SHOWN_POSES = 6
@@ -114,7 +114,12 @@ def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame
                 "trueHeading": rounded(math.degrees(table.truth_heading_rad[i] + turn[i]), 2),
                 "turned": rounded(math.degrees(table.heading_error_rad[i]), 2) if is_fix else None,
                 "headingStd": rounded(math.degrees(table.heading_std_rad[i]), 2) if is_fix else None,
-                "aligned": _poses(table.aligned, i, backdrop, with_ellipse=False),
+                "aligned": [
+                    [*row, int(source)]
+                    for row, source in zip(
+                        _poses(table.aligned, i, backdrop, with_ellipse=False), table.aligned_sources[i], strict=False
+                    )
+                ],
                 "hypotheses": _poses(table.hypotheses, i, backdrop, with_ellipse=True),
             }
         scans.append(scan)
@@ -125,6 +130,7 @@ def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame
         "reasons": list(reasons),
         "classes": [*limits, {"limit": None, "name": WORST[0]}],
         "states": {state.value: words for state, words in STATE_WORDS.items()},
+        "exhaustive": EXHAUSTIVE,
         "tracked": table.has_track,
         "shown": SHOWN_CANDIDATES,
         "top": top,

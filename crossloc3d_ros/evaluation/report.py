@@ -354,8 +354,9 @@ def _words(evaluation: Evaluation, aerial_map: AerialMap, about: About) -> str:
             "<h3>What counts as the truth</h3>"
             f"<p>Topic <code>{escape(truth.topic)}</code>, interpolated at the stamp of each scan: {len(truth):,} "
             f"positions were used and {truth.dropped:,} left out because the receiver had no fix or doubted it by more "
-            f"than 10 m. The antenna is taken for the robot. Errors are horizontal; heights are not scored."
-            f"{_truth_error_words(truth, tracked=tracked)}</p>"
+            "than 10 m. The antenna is taken for the robot. Errors are horizontal; heights are not scored."
+            f"{_truth_heading_words(evaluation) if tracked else ''}"
+            f"{_truth_error_words(truth) if tracked else ''}</p>"
         )
     limits = [
         *([] if tracked else ["Heading is not estimated: the answer is a place, not a pose."]),
@@ -382,7 +383,7 @@ def _pose_words(retrieval: str) -> str:
 
 
 def _honesty_words(track: TrackScores) -> str:
-    two = track.coverage[1]
+    two, errors = track.coverage[1], track.errors
     if not math.isfinite(two.position):
         return (
             "<h3>Why there is no fix</h3><p>No scan left so little doubt that a fix was given. Step through the scans "
@@ -399,15 +400,21 @@ def _honesty_words(track: TrackScores) -> str:
     return (
         "<h3>How to read the calibration</h3>"
         f"<p>Inside of 2 sigma, the ellipse that should hold {percent(two.expected)} of the errors, lie "
-        f"{percent(two.position)} of {track.errors.count:,} fixes, {judgement} Errors of neighbouring scans are much "
+        f"{percent(two.position)} of {errors.count:,} fixes, {judgement} Errors of neighbouring scans are much "
         "alike, so one drive says less of it than the number of scans suggests. Belief speaks of something else, the "
         f"error being below {WRONG_M:g} m: of a hundred scans that are believed by 90 %, ten should be wrong. A fix "
-        f"needs more than that. {_wrong_words(track)}</p>"
+        f"needs more than that: {errors.wrong:,} of {errors.count:,} were wrong.</p>"
     )
 
 
-def _truth_error_words(truth: TruthTrack, *, tracked: bool) -> str:
-    if not tracked or not truth.std_m > 0.0:
+def _truth_heading_words(evaluation: Evaluation) -> str:
+    if evaluation.heading_topic is None:
+        return " Nothing tells the true heading, so headings are not scored."
+    return f" The true heading is that of <code>{escape(evaluation.heading_topic)}</code>."
+
+
+def _truth_error_words(truth: TruthTrack) -> str:
+    if not truth.std_m > 0.0:
         return ""
     return (
         f" The receiver itself doubts its positions by {metres(truth.std_m)} in the median: errors of that size, and "

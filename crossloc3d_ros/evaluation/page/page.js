@@ -171,8 +171,10 @@
     const poses = rows => rows.map((row, i) => [i + 1, percent(row[3]), metres(offBy(scan, row[0], row[1])),
       degrees(between(row[2], scan.trueHeading))]);
     const heads = ["#", "belief", "off by", "turned by"];
+    const source = s => s === data.exhaustive ? "map" : s < 0 ? `hypothesis ${-s}` : `square ${s + 1}`;
     if (scan.hypotheses && scan.hypotheses.length) panel.append(...fold("hypotheses", "Hypotheses", heads, poses(scan.hypotheses)));
-    if (scan.aligned && scan.aligned.length) panel.append(...fold("aligned", "Aligned poses, this scan alone", heads, poses(scan.aligned)));
+    if (scan.aligned && scan.aligned.length) panel.append(...fold("aligned", "Aligned poses of this scan",
+      [...heads, "found at"], poses(scan.aligned).map((row, i) => [...row, source(scan.aligned[i][4])])));
     if (!scan.candidates.length) return;
     const rows = scan.candidates.slice(0, data.shown).map((c, i) => [i + 1, c[2] === null ? "–" : c[2].toFixed(3),
       c[3] === null ? "–" : (100 * c[3]).toFixed(1) + " %", metres(offBy(scan, c[0], c[1]))]);
