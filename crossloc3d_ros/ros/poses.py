@@ -21,6 +21,7 @@ EARTH_FRAME_ID = "earth"
 """ECEF (REP-105): the map's origin explains it, and TF need not."""
 OUTSIDE_M = 100.0
 """An initial pose may lie so far outside of the map: whoever points at its border means the border."""
+FARTHEST_M = 1e6
 LEAST_STD_M, LEAST_STD_RAD = 0.1, math.radians(0.5)
 UNSAID_STD_M, UNSAID_STD_RAD = 2.0, math.radians(20.0)
 """Of a pose whose covariance is all zeros, which in ROS means that nobody has filled it in."""
@@ -47,6 +48,8 @@ def initial_pose(
         raise PoseError("the pose lies on its side in the map: z must point up (REP-103)")
     covariance = _map_covariance(np.array(pose.covariance, dtype=np.float64).reshape(6, 6), T_map_frame[:3, :3])
     yaw = math.atan2(T_map_base[1, 0], T_map_base[0, 0])
+    if np.abs(T_map_base[:3, 3]).max() > FARTHEST_M:
+        raise PoseError("it lies outside of the map, and of what a map can be")
     grid, heading = in_grid(frame, T_map_base[:3, 3], yaw)
     turn = heading - yaw
     R = np.array([[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]])
@@ -115,12 +118,11 @@ def _map_covariance(covariance: Float64Array, R_map_frame: Float64Array) -> Floa
     R[:3, :3] = R[3:, 3:] = R_map_frame
     wanted = np.ix_([0, 1, 5], [0, 1, 5])
     result: Float64Array = (R @ bounded @ R.T)[wanted]
+    unit = result / np.sqrt(np.outer(np.diag(result), np.diag(result)).clip(1e-300))
+    if np.linalg.eigvalsh(unit)[0] < -1e-3:
+        raise PoseError("its covariance is none: correlations exceed 1")
     floor = np.array([LEAST_STD_M, LEAST_STD_M, LEAST_STD_RAD]) ** 2
     result[np.diag_indices(3)] = np.maximum(np.diag(result), floor)
-    try:
-        np.linalg.cholesky(result)
-    except np.linalg.LinAlgError as error:
-        raise PoseError("its covariance is none: correlations exceed 1") from error
     return result
 
 

@@ -206,9 +206,7 @@ def test_a_stamp_keeps_every_nanosecond() -> None:
 def test_a_transform_is_the_mounting_that_it_says() -> None:
     mounting = MountingConfig(x_m=0.3, y_m=-0.2, z_m=1.4, yaw_deg=90.0)
     half = np.sqrt(0.5)
-    transform = Transform(
-        translation=Vector3(x=0.3, y=-0.2, z=1.4), rotation=Quaternion(x=0.0, y=0.0, z=2 * half, w=2 * half)
-    )
+    transform = Transform(translation=Vector3(x=0.3, y=-0.2, z=1.4), rotation=Quaternion(x=0.0, y=0.0, z=half, w=half))
     np.testing.assert_allclose(matrix_from_transform(transform), mounting_matrix(mounting), atol=1e-12)
 
 
