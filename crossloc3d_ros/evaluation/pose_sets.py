@@ -200,7 +200,7 @@ def make_pose_set(
 ) -> PoseSet:
     """Make a simulated set, or what is missing of it, in `data/pose-NAME-HASH`, and load it."""
     report = progress or (lambda stage, done, total, unit: None)
-    settings = _settings_of(poses)
+    settings = settings_of(poses)
     folder = benchmark.folder_of(data, f"pose-{name}", settings)
     parts = _parts_of(poses, folder, settings)
     with benchmark.alone(folder):
@@ -264,7 +264,7 @@ def load_pose_set(folder: Path, map_folder: Path | None = None) -> PoseSet:
         raise EvaluationError(f"{folder / MANIFEST} is damaged ({error}); make the set anew") from error
 
 
-def _settings_of(poses: SimulatedPoses) -> dict[str, Any]:
+def settings_of(poses: SimulatedPoses) -> dict[str, Any]:
     """Return everything that decides what the set holds; the encoder is no part of it."""
     settings = dataclasses.asdict(poses)
     for name in ("workers", "chunk_points"):  # how the builder works, not what comes out
