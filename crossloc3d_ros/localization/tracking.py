@@ -133,7 +133,6 @@ class Tracker:
         self._elsewhere = 1.0  # share of that belief that may still turn out to be a place of the map
         self._moved_m: float | None = None  # way since the last update; None = unknown
         self._carried = 0.0  # belief that the robot was carried away since the last update
-        self._first = True
         self._was_localized = False
         self._unknown_reason = ""
         self._skipped = ""
@@ -198,19 +197,15 @@ class Tracker:
         open_none = self._log_none + math.log(self._elsewhere)
         births = self._births(poses, np.logaddexp(open_none, carried), aligned.log_prior, branches)
         self._mixture = branches[0].join(births)
-        missed = 1.0 - config.found_share
-        # The hope to find the place that was missed so far shrinks with every look that is news.
+        # Where it was missed so far, it may yet be found, the less likely the more spots it was missed at.
         hope = self._elsewhere * (1.0 - news * config.found_share) * _STALE_SHARE
         hope += (1.0 - hope) * self._carried
-        none = np.logaddexp(self._log_none, carried)
-        self._elsewhere = float(
-            np.exp(np.logaddexp(self._log_none + math.log(hope), carried + math.log(missed)) - none)
-        )
-        self._log_none = float(none)
-        self._first, self._moved_m, self._carried = False, 0.0, 0.0
+        none = float(np.logaddexp(self._log_none, carried))
+        self._elsewhere = float(np.exp(np.logaddexp(self._log_none + math.log(hope), carried) - none))
+        self._log_none, self._moved_m, self._carried = none, 0.0, 0.0
         self._normalize()
         self._mixture = _merge(self._mixture, config.max_hypotheses)
-        self._normalize()
+        self._normalize_none()
         self._belief = self._judge()
         return self._belief
 
@@ -275,9 +270,7 @@ class Tracker:
 
     def _news(self) -> float:
         """Return which share of what the scan tells is news, in [0, 1]."""
-        if self._first:
-            return 1.0
-        # Of an unknown way none is granted.
+        # Of an unknown way none is granted; the first look at a spot counts in full whatever it is.
         return -math.expm1(-(self._moved_m or 0.0) / self._config.evidence_m)
 
     def _poses(self, aligned: AlignedPoses) -> AlignedPoses:
@@ -371,15 +364,16 @@ class Tracker:
         )  # fmt: skip
 
     def _normalize(self) -> None:
-        total = float(np.logaddexp(_log_sum(self._mixture.log_weight), self._log_none)) if len(self._mixture) else (
-            self._log_none
-        )  # fmt: skip
-        self._log_none -= total
+        """Scale the weights so that they and the belief in none sum to 1, and drop the lightest hypotheses."""
+        total = float(np.logaddexp(_log_sum(self._mixture.log_weight), self._log_none))
+        self._log_none = max(self._log_none - total, 2.0 * _LEAST_LOG_WEIGHT)
         log_weight = self._mixture.log_weight - total
-        self._mixture = dataclasses.replace(self._mixture, log_weight=log_weight)
-        light = log_weight < _LEAST_LOG_WEIGHT
-        self._mixture = self._mixture.take(~light)
-        self._log_none = max(self._log_none, 2.0 * _LEAST_LOG_WEIGHT)
+        self._mixture = dataclasses.replace(self._mixture, log_weight=log_weight).take(log_weight > _LEAST_LOG_WEIGHT)
+
+    def _normalize_none(self) -> None:
+        """Give the belief in hypotheses that were dropped to none."""
+        none = 1.0 - float(np.exp(self._mixture.log_weight).sum())
+        self._log_none = math.log(max(none, math.exp(self._log_none)))
 
     # Judgement
 
