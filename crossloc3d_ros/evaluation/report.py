@@ -194,7 +194,7 @@ def _search_table(track: TrackScores) -> str:
         rows.append(
             f"<tr><th scope='row'>{escape(search.cause)}<small>at {search.start_s:.1f} s, scan {search.start + 1:,}"
             f"</small></th><td><b>{metres(search.travelled_m)}</b></td><td>{search.seconds:.1f} s</td>"
-            f"<td>{'found' if search.end is not None else 'not found until the end'}</td>"
+            f"<td>{'found' if search.end is not None else 'not found'}</td>"
             f"<td>{search.wrong_fixes:,}</td></tr>"
         )
     short = ""
