@@ -17,10 +17,13 @@ from PIL import Image
 from crossloc3d_ros.clouds.raster import Raster
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation import backdrop, charts, replay_map, report
-from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
+from crossloc3d_ros.evaluation.estimates import EstimateTable, PoseLists, no_pose_lists
 from crossloc3d_ros.evaluation.replay import Evaluation, score_table
+from crossloc3d_ros.evaluation.track_scores import score_track
 from crossloc3d_ros.evaluation.truth import TruthTrack
+from crossloc3d_ros.evaluation.wording import degrees, metres, percent
 from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.types import EXHAUSTIVE, TrackState
 
 VOID = {"meta", "input", "link", "br", "img", "hr"}
 NASTY = "</script><script>alert(1)</script> & \"quotes\" {{data}} 'x'"
@@ -107,6 +110,46 @@ def made_up_table(
     )
 
 
+def tracked(table: EstimateTable, town_map: AerialMap, seed: int = 5) -> EstimateTable:
+    """Return the table with poses: fixes metres off, four hypotheses, eight aligned poses, some searching."""
+    rng = np.random.default_rng(seed)
+    scans = len(table)
+    true = table.truth_grid if np.isfinite(table.truth_grid).any() else table.grid[:, :2]
+    grid = np.column_stack([true + rng.normal(0, 0.5, (scans, 2)), np.zeros(scans)])
+    latitude, longitude, altitude = town_map.frame.to_geographic(grid)
+    states = [TrackState.LOCALIZED if fix else TrackState.SEARCHING for fix in table.has_fix]
+    states[: scans // 5] = [TrackState.AMBIGUOUS] * (scans // 5)
+    covariance = np.zeros((scans, 3, 3))
+    covariance[:, [0, 1], [0, 1]] = [0.25, 0.16]
+    heading = rng.uniform(-np.pi, np.pi, scans)
+
+    def poses(count: int, spread_m: float) -> PoseLists:
+        places = true[:, None] + rng.normal(0, spread_m, (scans, count, 2))
+        return PoseLists(
+            np.where(np.isfinite(places), places, 0.0),
+            rng.uniform(-np.pi, np.pi, (scans, count)),
+            np.tile(np.diag([9.0, 4.0]), (scans, count, 1, 1)),
+            np.full((scans, count), 0.02),
+            np.sort(rng.dirichlet(np.ones(count), scans), axis=1)[:, ::-1],
+        )
+
+    return replace(
+        table,
+        has_fix=np.array([state is TrackState.LOCALIZED for state in states]),
+        grid=grid,
+        geographic=np.column_stack([latitude, longitude, altitude]),
+        covariance=covariance,
+        states=tuple(states),
+        probability=np.where([state is TrackState.LOCALIZED for state in states], 0.9995, rng.uniform(size=scans)),
+        heading_rad=heading + rng.normal(0, 0.01, scans),
+        heading_std_rad=np.full(scans, 0.01),
+        truth_heading_rad=heading if np.isfinite(table.truth_grid).any() else np.full(scans, np.nan),
+        aligned=poses(8, 20.0),
+        aligned_sources=np.tile(np.array([-1, EXHAUSTIVE, 2, 3, 4, 5, 6, -2]), (scans, 1)),
+        hypotheses=poses(4, 30.0),
+    )
+
+
 def page_of(
     table: EstimateTable, town_map: AerialMap, path: Path, about: report.About | None = None
 ) -> tuple[str, Page]:
@@ -114,7 +157,9 @@ def page_of(
     track = TruthTrack(
         "/gnss", table.stamp_ns[known], np.column_stack([table.truth_grid, table.truth_grid[:, 0]])[known], 3
     )
-    evaluation = Evaluation(table, track if known.any() else None, score_table(table, town_map))
+    evaluation = Evaluation(
+        table, track if known.any() else None, score_table(table, town_map), score_track(table), "/truth/heading"
+    )
     report.write_report(path, evaluation, town_map, about or report.About("A drive", {"bag": "drive", "map": "town"}))
     text = path.read_text(encoding="utf-8")
     return text, Page(text)
@@ -124,8 +169,10 @@ def data_of(page: Page) -> dict:
     return json.loads(page.scripts[0], parse_constant=pytest.fail)
 
 
-def test_the_page_needs_nothing_but_itself(town_map: AerialMap, tmp_path: Path) -> None:
-    text, page = page_of(made_up_table(town_map), town_map, tmp_path / "page.html")
+@pytest.mark.parametrize("with_track", [False, True], ids=["places", "poses"])
+def test_the_page_needs_nothing_but_itself(town_map: AerialMap, tmp_path: Path, with_track: bool) -> None:
+    table = made_up_table(town_map)
+    text, page = page_of(tracked(table, town_map) if with_track else table, town_map, tmp_path / "page.html")
     assert page.references
     assert all(reference.startswith("data:") for reference in page.references)
     without_namespaces = text.replace("http://www.w3.org/2000/svg", "")
@@ -177,8 +224,66 @@ def test_the_script_gets_every_scan(town_map: AerialMap, tmp_path: Path) -> None
             assert scan["at"] is None
 
 
+def test_the_words_of_a_track_are_its_figures(town_map: AerialMap, tmp_path: Path) -> None:
+    table = tracked(made_up_table(town_map, scans=80), town_map)
+    scores = score_track(table)
+    assert scores is not None
+    _, page = page_of(table, town_map, tmp_path / "page.html")
+    words = " ".join(" ".join(page.words).split())
+    errors, two = scores.errors, scores.coverage[1]
+    for text in (
+        f"{metres(errors.median_m)}",
+        f"95 % within {metres(errors.p95_m)}",
+        f"95 % within {degrees(errors.p95_deg)}",
+        f"{errors.wrong:,} of {errors.count:,} off by over 10 m",
+        f"should be {percent(two.expected)}",
+        f"from nothing at 0.0 s, scan 1 {metres(scores.searches[0].travelled_m)}",
+        "/truth/heading",
+        "several places",
+    ):
+        assert text in words
+    assert {"states", "errors", "headings", "beliefs", "belief-calibration", "coverage", "closeup"} <= set(page.ids)
+
+
+def test_the_script_gets_poses_in_the_frame_of_the_map(town_map: AerialMap, tmp_path: Path) -> None:
+    """True headings are from true east; on the map they are drawn from grid east."""
+    table = tracked(made_up_table(town_map), town_map)
+    _, page = page_of(table, town_map, tmp_path / "page.html")
+    data = data_of(page)
+    assert data["tracked"]
+    west, _, _, north = town_map.bounds
+    places = np.column_stack([table.truth_grid, np.zeros(len(table))])
+    turn = np.degrees(town_map.frame.convergence_rad(places))
+    assert np.abs(turn).min() > 0.5  # or the test could not tell one from the other
+    for i, scan in enumerate(data["scans"]):
+        state = table.states[i]
+        assert state is not None
+        assert scan["state"] == state.value
+        assert scan["belief"] == pytest.approx(table.probability[i], abs=1e-6)
+        off = scan["trueHeading"] - turn[i] - np.degrees(table.truth_heading_rad[i])
+        assert (off + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
+        assert len(scan["hypotheses"]) == 4
+        for rank, (x, y, heading, belief, major, minor, angle) in enumerate(scan["hypotheses"]):
+            assert [west + x, north - y] == pytest.approx(table.hypotheses.grid[i, rank], abs=0.01)
+            assert heading == pytest.approx(np.degrees(table.hypotheses.heading_rad[i, rank]), abs=0.06)
+            assert belief == pytest.approx(table.hypotheses.probabilities[i, rank], abs=1e-5)
+            assert (major, minor) == pytest.approx(np.sqrt(5.9915) * np.array([3.0, 2.0]), abs=0.01)
+            assert angle % 180.0 == pytest.approx(0.0)
+        assert [pose[4] for pose in scan["aligned"]] == table.aligned_sources[i, : replay_map.SHOWN_POSES].tolist()
+        assert (scan["turned"] is None) == (not table.has_fix[i])
+
+
+def test_one_scan_alone_is_not_credited_with_what_earlier_ones_found(town_map: AerialMap) -> None:
+    table = tracked(made_up_table(town_map, scans=6), town_map)
+    grid, heading = table.first_aligned
+    np.testing.assert_array_equal(grid, table.aligned.grid[:, 1])  # the first began at a hypothesis
+    np.testing.assert_array_equal(heading, table.aligned.heading_rad[:, 1])
+    hypotheses_only = replace(table, aligned_sources=np.full((6, 8), -1))
+    assert np.isnan(hypotheses_only.first_aligned[0]).all()
+
+
 def test_what_others_wrote_cannot_break_the_page(town_map: AerialMap, tmp_path: Path) -> None:
-    table = made_up_table(town_map, scans=3, reason=NASTY)
+    table = tracked(made_up_table(town_map, scans=3, reason=NASTY), town_map)
     about = report.About(NASTY, {NASTY: NASTY}, notes=(NASTY,), footer=NASTY, latency_is=NASTY, extra_words=(NASTY,))
     _, page = page_of(table, town_map, tmp_path / "page.html", about)
     assert len(page.scripts) == 2  # the data and the page's own, nothing of the reason's
@@ -186,18 +291,26 @@ def test_what_others_wrote_cannot_break_the_page(town_map: AerialMap, tmp_path: 
     assert NASTY in "".join(page.words)
 
 
-@pytest.mark.parametrize("case", ["no truth", "no fix", "no candidates", "one scan", "no latency"])
-def test_every_kind_of_drive_makes_a_page(town_map: AerialMap, tmp_path: Path, case: str) -> None:
+@pytest.mark.parametrize("with_track", [False, True], ids=["places", "poses"])
+@pytest.mark.parametrize("case", ["no truth", "no fix", "no candidates", "one scan", "no latency", "no headings"])
+def test_every_kind_of_drive_makes_a_page(town_map: AerialMap, tmp_path: Path, case: str, with_track: bool) -> None:
     table = made_up_table(
         town_map,
         scans=1 if case == "one scan" else 12,
         top=0 if case == "no candidates" else 25,
         truth=case != "no truth",
     )
+    if with_track:
+        table = tracked(table, town_map)
     if case in ("no fix", "no candidates"):
         table = replace(table, has_fix=np.zeros(len(table), dtype=bool), covariance=np.full((len(table), 3, 3), np.nan))
     if case == "no candidates":
         table = replace(table, grid=np.full_like(table.grid, np.nan), geographic=np.full_like(table.geographic, np.nan))
+        nothing = np.full(len(table), np.nan)
+        table = replace(table, aligned=no_pose_lists(len(table)), aligned_sources=np.empty((len(table), 0), np.int64))
+        table = replace(table, hypotheses=no_pose_lists(len(table)), heading_rad=nothing, heading_std_rad=nothing)
+    if case == "no headings":
+        table = replace(table, truth_heading_rad=np.full(len(table), np.nan))
     if case == "no latency":
         table = replace(table, timings_ms=np.full_like(table.timings_ms, np.nan))
     text, page = page_of(table, town_map, tmp_path / "page.html")
@@ -206,7 +319,7 @@ def test_every_kind_of_drive_makes_a_page(town_map: AerialMap, tmp_path: Path, c
 
 
 def test_a_long_drive_is_thinned_on_the_page_alone(town_map: AerialMap, tmp_path: Path) -> None:
-    table = made_up_table(town_map, scans=3301, top=5)
+    table = tracked(made_up_table(town_map, scans=3301, top=5), town_map)
     text, page = page_of(table, town_map, tmp_path / "page.html")
     assert 1500 < len(data_of(page)["scans"]) <= 3000
     assert f"{3301:,}" in text
