@@ -28,6 +28,7 @@ from crossloc3d_ros.errors import CrossLocError, MapError
 from crossloc3d_ros.evaluation.estimates import EstimateTable, write_atomically
 from crossloc3d_ros.evaluation.replay import ESTIMATES, evaluate
 from crossloc3d_ros.evaluation.report import About
+from crossloc3d_ros.evaluation.wording import UNKNOWN, degrees, metres, percent
 from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.places.builder import build_map
@@ -207,7 +208,9 @@ def make_drive(survey: Path, bag_path: Path, plan: DemoDrive, target: Console) -
 def beside_the_truth(table: EstimateTable, frame: MapFrame) -> Table:
     """Return fixes and truth side by side, a scan every few seconds."""
     result = Table(title="Fixes beside the truth", title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    for name in ("time", "truth", "fix", "off by", "1st cand.", "belief", "latency"):
+    tracked = table.has_track
+    last = ("turned", "belief", "state") if tracked else ("1st cand.", "belief", "latency")
+    for name in ("time", "truth", "fix", "off by", *last):
         result.add_column(name, justify="right", no_wrap=True)
     if not len(table):
         return result
@@ -217,23 +220,32 @@ def beside_the_truth(table: EstimateTable, frame: MapFrame) -> Table:
     if known.any():
         places = np.column_stack([table.truth_grid[known], np.zeros(int(known.sum()))])
         latitude[known], longitude[known], _ = frame.to_geographic(places)
-    errors = table.error_m
+    errors, turned_deg = table.error_m, np.degrees(np.abs(table.heading_error_rad))
     first_errors, beliefs = np.full(len(table), np.nan), np.full(len(table), np.nan)
     if table.candidate_ids.shape[1]:
         first_errors = np.hypot(*(table.candidate_grid[:, 0] - table.truth_grid).T)
         beliefs = table.candidate_probabilities[:, 0]
     for moment in np.arange(0.0, seconds[-1] + 1e-9, _SHOWN_EVERY_S):
         i = int(np.searchsorted(seconds, moment - 1e-9))
-        first, belief = first_errors[i], beliefs[i]
-        fixed = table.has_fix[i]
+        fixed, state, latency = table.has_fix[i], table.states[i], table.latency_ms[i]
+        if tracked:
+            cells = [
+                degrees(turned_deg[i]) if fixed else UNKNOWN,
+                percent(table.probability[i]),
+                UNKNOWN if state is None else state.value,
+            ]
+        else:
+            cells = [
+                f"{first_errors[i]:.0f} m" if np.isfinite(first_errors[i]) else UNKNOWN,
+                f"{beliefs[i]:.0%}" if np.isfinite(beliefs[i]) else UNKNOWN,
+                f"{latency:.0f} ms" if np.isfinite(latency) else UNKNOWN,
+            ]
         result.add_row(
             f"{seconds[i]:.1f} s",
-            f"{latitude[i]:.5f}, {longitude[i]:.5f}" if known[i] else "–",
+            f"{latitude[i]:.5f}, {longitude[i]:.5f}" if known[i] else UNKNOWN,
             f"{table.geographic[i, 0]:.5f}, {table.geographic[i, 1]:.5f}" if fixed else "no fix",
-            f"{errors[i]:.0f} m" if fixed and np.isfinite(errors[i]) else "–",
-            f"{first:.0f} m" if np.isfinite(first) else "–",
-            f"{belief:.0%}" if np.isfinite(belief) else "–",
-            f"{table.latency_ms[i]:.0f} ms" if np.isfinite(table.latency_ms[i]) else "–",
+            metres(errors[i]) if fixed else UNKNOWN,
+            *cells,
         )
     return result
 
@@ -248,6 +260,7 @@ def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int
             "map": "AHN2, flown 2010",
             "drive": "simulated VLP-16 in AHN3, flown 2014",
             "weights": f"{arguments.weights or 'as shipped'} ({encoder.fingerprint[:12]})",
+            "odometry": "of the wheels, drifting",
             "run": "the real node as a process, the bag played into it over DDS in real time",
             "unanswered": f"{dropped:,} of {scans:,} scans",
         },
@@ -284,7 +297,7 @@ def _in_brief(newest: Estimate | None) -> str:
     if newest is None:
         return "no answer yet"
     if newest.status is not FixStatus.FIX:
-        return "no fix"
+        return f"no fix, {newest.state.value}"
     return f"fix {newest.latitude_deg:.5f}, {newest.longitude_deg:.5f}"
 
 

@@ -14,6 +14,7 @@ from crossloc3d_ros.cli import demo
 from crossloc3d_ros.errors import MapError
 from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.types import TrackState
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -77,7 +78,8 @@ def test_an_interrupted_build_is_not_taken_for_current(tmp_path: Path, monkeypat
     assert list(tmp_path.glob("*.made-from.json")) == []
 
 
-def test_fixes_stand_beside_the_truth() -> None:
+@pytest.mark.parametrize("tracked", [False, True])
+def test_fixes_stand_beside_the_truth(tracked: bool) -> None:
     frame = MapFrame("EPSG:32631", np.array([628_700.0, 5_803_600.0, 2.0]), 43.0)
     count = 121
     truth = np.column_stack([628_700.0 + np.arange(count), np.full(count, 5_803_600.0)])
@@ -97,9 +99,10 @@ def test_fixes_stand_beside_the_truth() -> None:
         candidate_grid=truth[:, None] + np.array([0.0, 12.0]),
         truth_grid=truth,
         truth_heading_rad=np.zeros(count),
-        states=(None,) * count,
-        probability=np.full(count, np.nan),
-        heading_rad=np.full(count, np.nan),
+        states=((TrackState.LOCALIZED if tracked else None),) * 60
+        + ((TrackState.AMBIGUOUS if tracked else None),) * 61,
+        probability=np.full(count, 0.99912 if tracked else np.nan),
+        heading_rad=np.full(count, np.radians(-1.2) if tracked else np.nan),
         heading_std_rad=np.full(count, np.nan),
         aligned=no_pose_lists(count),
         aligned_sources=np.empty((count, 0), dtype=np.int64),
@@ -114,7 +117,12 @@ def test_fixes_stand_beside_the_truth() -> None:
     assert len(rows) == 3  # every five seconds of twelve
     assert [("50" in row) for row in rows] == [True, True, False]
     assert "no fix" in lines[-1]
-    assert all("12" in row and "75%" in row for row in rows)
+    if tracked:
+        assert [row[-1] for row in rows] == ["localized", "localized", "ambiguous"]
+        assert ["1.2°" in row for row in rows] == [True, True, False]
+        assert all("99.9" in row for row in rows)
+    else:
+        assert all("12" in row and "75%" in row for row in rows)
     assert f"{latitude[0]:.5f}," in rows[0]
 
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.cli import replay
-from crossloc3d_ros.config import BuildConfig, ModelConfig, PreprocessingConfig
-from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.config import BuildConfig, LocalizerNodeConfig, ModelConfig, PreprocessingConfig, from_dict
+from crossloc3d_ros.errors import BagError, ConfigError
 from crossloc3d_ros.formats import bag
 
 SMALL_MODEL = ModelConfig(
@@ -91,7 +91,7 @@ def test_the_same_command_gives_the_same_estimates(
     installed: Installation, results: tuple[Path, str], tmp_path: Path
 ) -> None:
     assert replay.main(installed.arguments(tmp_path)) == 0
-    timings = {"prepare_ms", "encode_ms", "search_ms", "latency_ms"}
+    timings = {"prepare_ms", "encode_ms", "search_ms", "align_ms", "fuse_ms", "latency_ms"}
     first, second = (
         [{k: v for k, v in row.items() if k not in timings} for row in rows_of(folder)]
         for folder in (results[0], tmp_path)
@@ -147,6 +147,12 @@ def test_bad_input_is_refused_in_one_line(
     assert "its topics are: /gnss" in fails(capsys, installed.arguments(out, "--gnss-topic", "/gps"))
     assert "its topics are: /gnss" in fails(capsys, installed.arguments(out, "--imu-topic", "/imu"))
     assert "holds sensor_msgs/msg/NavSatFix" in fails(capsys, installed.arguments(out, "--topic", "/gnss"))
+    assert "its topics are: /gnss" in fails(capsys, installed.arguments(out, "--odom-topic", "/wheels"))
+    assert "has no topic of type nav_msgs/msg/Odometry" in fails(
+        capsys, installed.arguments(out, "--odometry", "topic")
+    )
+    told = installed.arguments(out, "--odometry", "scan", "--odom-topic", "/odom")
+    assert "--odom-topic has no meaning with --odometry scan" in fails(capsys, told)
     assert "--every must be at least 1" in fails(capsys, [*installed.arguments(out), "--every", "0"])
     assert "'scan.mounting.z_m' must lie between" in fails(capsys, installed.arguments(out, "--z-m", "1e6"))
     no_map = Installation(installed.weights, tmp_path, installed.bag)
@@ -229,6 +235,33 @@ def test_ctrl_c_keeps_what_was_localized(installed: Installation, tmp_path: Path
     assert 3 <= len(rows) < 40 * 20
     assert all(row["latency_ms"] for row in rows)
     assert "interrupted" in (out / "index.html").read_text()
+
+
+def test_the_odometry_is_found_or_named(tmp_path: Path) -> None:
+    def chosen(names: list[str], topic: str | None = None, asked_for: bool = False, **settings: str) -> str | None:
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        with bag.BagWriter(path) as writer:
+            writer.add_topic("/points", bag.POINT_CLOUD)
+            for name in names:
+                writer.add_topic(name, bag.ODOMETRY)
+            writer.write("/gnss", bag.NAV_SAT_FIX, 1, bag.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
+        with bag.open_bag(path) as reader:
+            config = from_dict(LocalizerNodeConfig, settings)
+            source = replay.choose_odometry(reader, topic, config, asked_for=asked_for)
+        return None if source is None else source.topic or "scans"
+
+    assert chosen([]) is None
+    assert chosen(["/ground_truth/odom"]) is None
+    assert chosen(["/wheels", "/ground_truth/odom"]) == "/wheels"
+    assert chosen(["/wheels", "/odom"]) == "/odom"
+    assert chosen(["/wheels", "/odom"], "/wheels") == "/wheels"
+    assert chosen(["/odom"], odometry="none") is None
+    assert chosen(["/odom"], odometry="scan") == "scans"
+    assert chosen(["/ground_truth/odom"], "/ground_truth/odom") == "/ground_truth/odom"
+    with pytest.raises(BagError, match=r"several odometry topics .*--odom-topic"):
+        chosen(["/wheels", "/visual"])
+    with pytest.raises(BagError, match="beside ground truth"):
+        chosen(["/ground_truth/odom"], asked_for=True)
 
 
 @pytest.mark.parametrize(
