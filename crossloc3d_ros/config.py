@@ -122,7 +122,7 @@ class FusionConfig:
     min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
     confirm_m: float = option(3.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
     max_hypotheses: int = option(10, "poses carried along at most", low=1, high=1000)
-    evidence_m: float = option(10.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
+    evidence_m: float = option(20.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
     evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
     blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
     found_share: float = option(

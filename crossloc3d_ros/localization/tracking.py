@@ -409,10 +409,7 @@ class Tracker:
         if is_fix:
             self._was_localized, self._unknown_reason = True, ""
             state, reason = TrackState.LOCALIZED, f"one place is believed {_percent(probability)}"
-            if mixture.misfit[leader] > 2.5:
-                reason += (
-                    f", though odometry and map disagree {mixture.misfit[leader] ** 0.5:.1f} times as much as expected"
-                )
+            reason += _odometry_fault(mixture, leader, config)
         else:
             if none < 0.5:
                 state = TrackState.AMBIGUOUS
@@ -444,13 +441,13 @@ class Tracker:
                 "the place that was believed no longer fits the scans" if self._was_localized else "nothing fits well"
             )
             return f"{what}: {_percent(none)} of the belief is in no place of the map"
-        others = np.flatnonzero(~near)
-        if len(others) and weights[others].sum() > none:
-            rival = others[np.argmax(weights[others])]
+        rivals = np.flatnonzero(~near & (weights > 0.01 * belief))
+        if len(rivals) and weights[rivals].sum() > 0.5 * (1.0 - belief):
+            rival = rivals[np.argmax(weights[rivals])]
             leader = int(np.argmax(weights))
             apart = float(np.hypot(*(mixture.mean[leader] - mixture.mean[rival])[:2]))
             return (
-                f"{1 + len(others)} places are believed, {_percent(belief)} the likeliest, {_percent(weights[rival])}"
+                f"{1 + len(rivals)} places are believed, {_percent(belief)} the likeliest and {_percent(weights[rival])}"
                 f" one {apart:.0f} m away"
             )
         if probability < 0.9 * belief:
@@ -709,6 +706,19 @@ def _estimate(
     pose = mixture.mean[leader, :3] + middle
     grid = np.array([pose[0], pose[1], float(shares @ mixture.height[near])])
     return grid, float(_wrap(pose[2])), covariance, near
+
+
+def _odometry_fault(mixture: _Mixture, leader: int, config: FusionConfig) -> str:
+    """Say what is wrong with the odometry, as a clause that follows a sentence; empty where nothing is."""
+    scale, turn_deg = float(mixture.mean[leader, 6]), math.degrees(mixture.mean[leader, 7])
+    if abs(scale) > 3.0 * config.odometry_error:
+        kind = "short" if scale > 0.0 else "long"
+        return f"; the odometry's ways are {abs(scale) / (1.0 + scale):.0%} too {kind}"
+    if abs(turn_deg) > 3.0 * config.odometry_turn_deg_per_m:
+        return f"; the odometry turns {-turn_deg:+.1f} degrees a metre that the robot does not"
+    if mixture.misfit[leader] > 2.5:
+        return f"; odometry and map disagree {mixture.misfit[leader] ** 0.5:.1f} times as much as they should"
+    return ""
 
 
 def _checked(motion: Motion | None, elapsed_s: float, config: FusionConfig) -> Motion:
