@@ -15,6 +15,8 @@ SETTINGS = {
     "map": (str, "folder of the aerial map"),
     "weights": (str, "weights file; the shipped weights where none is named"),
     "autostart": (bool, "whether the node configures and activates itself"),
+    "odometry": (str, "topic, scan or none: what tells how the robot has moved"),
+    "publish_tf": (bool, "whether map -> odom goes to /tf while localized"),
     "use_sim_time": (bool, "whether the time comes from /clock"),
 }
 """Parameters that can be given as arguments; what is left empty stays as the parameter file has it."""
@@ -26,7 +28,9 @@ def generate_launch_description() -> LaunchDescription:
     arguments = {
         **{name: ("", text) for name, (_, text) in SETTINGS.items()},
         "points": ("/velodyne_points", "topic of the clouds"),
-        "imu": ("/imu", "topic of the accelerations, where the parameter use_imu is set"),
+        "odom": ("/odom", "topic of the odometry"),
+        "imu": ("/imu", "topic of the IMU, where the parameter use_imu or use_imu_heading is set"),
+        "initialpose": ("/initialpose", "topic of first guesses, as RViz publishes them"),
         "params_file": (str(defaults), "file of all parameters"),
         "namespace": ("", "namespace of the node"),
         "log_level": ("info", "debug, info, warn or error"),
@@ -54,7 +58,7 @@ def start(context: LaunchContext) -> list[LifecycleNode]:
             namespace=given("namespace"),
             output="screen",
             parameters=[given("params_file"), settings],
-            remappings=[("points", given("points")), ("imu", given("imu"))],
+            remappings=[(name, given(name)) for name in ("points", "odom", "imu", "initialpose")],
             ros_arguments=["--log-level", given("log_level")],
         )
     ]

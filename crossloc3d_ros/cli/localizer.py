@@ -15,19 +15,34 @@ USAGE = """usage: localizer --ros-args -p map:=FOLDER [-p NAME:=VALUE ...] [--pa
 Tell from LiDAR scans where on an aerial map the robot is.
 
 subscribes  points                           sensor_msgs/PointCloud2
-            imu                              sensor_msgs/Imu, where use_imu is set
+            odom                             nav_msgs/Odometry, where odometry is topic
+            imu                              sensor_msgs/Imu, where use_imu or use_imu_heading is set
+            initialpose                      geometry_msgs/PoseWithCovarianceStamped, in `map`, `earth` or what TF knows
 publishes   ~/fix                            sensor_msgs/NavSatFix, one for each scan that is worked on
             ~/pose                           geometry_msgs/PoseWithCovarianceStamped, latched, only with a fix
+            ~/state                          diagnostic_msgs/DiagnosticStatus, latched: searching, ambiguous,
+                                             localized or lost, and why
+            ~/hypotheses                     geometry_msgs/PoseArray, likeliest first
             ~/candidates                     geometry_msgs/PoseArray
-            ~/candidate_table                sensor_msgs/PointCloud2
+            ~/candidate_table                sensor_msgs/PointCloud2, with the pose at which the scan fits around each
             ~/markers                        visualization_msgs/MarkerArray
             ~/map_origin                     sensor_msgs/NavSatFix, latched: where the frame `map` has its origin
             /diagnostics                     diagnostic_msgs/DiagnosticArray
+            /tf                              from `map` to the odometry's frame, where publish_tf is set
 service     reinitialize_global_localization std_srvs/Empty
 
 parameters
 """
-ROS_PACKAGES = "rclpy", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs", "diagnostic_msgs", "visualization_msgs"
+ROS_PACKAGES = (
+    "rclpy",
+    "sensor_msgs",
+    "geometry_msgs",
+    "nav_msgs",
+    "std_msgs",
+    "std_srvs",
+    "diagnostic_msgs",
+    "visualization_msgs",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

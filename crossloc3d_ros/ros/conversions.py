@@ -158,12 +158,14 @@ def in_map(frame: MapFrame, grid: Float64Array, heading_rad: Float64Array) -> tu
     return enu, np.arctan2(direction[:, 1], direction[:, 0])
 
 
-def in_grid(frame: MapFrame, enu: Float64Array, yaw_rad: float) -> tuple[Float64Array, float]:
-    """Return position (3,) and heading, from grid east, of a pose in the map frame: (3,) and its yaw."""
-    ahead = enu + np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
-    grid = frame.from_enu(np.stack([enu, ahead]))
-    direction = grid[1] - grid[0]
-    return grid[0], math.atan2(direction[1], direction[0])
+def in_grid(frame: MapFrame, enu: Float64Array, yaw_rad: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return positions (n, 3) and headings (n,), from grid east, of poses in the map frame: (n, 3) and yaws (n,)."""
+    if len(enu) == 0:
+        return np.empty((0, 3)), np.empty(0)
+    ahead = enu + np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(enu))])
+    grid = frame.from_enu(enu)
+    direction = frame.from_enu(ahead) - grid
+    return grid, np.arctan2(direction[:, 1], direction[:, 0])
 
 
 def candidates_message(estimate: Estimate, frame: MapFrame, global_frame_id: str) -> PoseArray:

@@ -545,12 +545,15 @@ class LocalizerNode(LifecycleNode):
     def _motion_to(self, scan: Scan, T_base_lidar: Float64Array | None) -> Motion | None:
         """Return how the robot moved since the last localized scan, None where nothing tells."""
         if self._scan_odometry is not None:
-            T = mounting_matrix(self._config.scan.mounting) if T_base_lidar is None else T_base_lidar
-            self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points).astype(np.float64))
+            config = self._config.scan
+            T = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
+            ranges = np.linalg.norm(scan.points, axis=1)
+            used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
+            self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points[used]).astype(np.float64))
         source = self._odometry or self._scan_odometry
-        return (
-            None if source is None or self._localized_ns is None else source.motion(self._localized_ns, scan.stamp_ns)
-        )
+        if source is None or self._localized_ns is None:
+            return None
+        return source.motion(self._localized_ns, scan.stamp_ns)
 
     def _guess_heading(self, localizer: Localizer, stamp_ns: int) -> None:
         """Hand on what the IMU says of the heading, as long as nothing better is known."""

@@ -50,7 +50,7 @@ def initial_pose(
     yaw = math.atan2(T_map_base[1, 0], T_map_base[0, 0])
     if np.abs(T_map_base[:3, 3]).max() > FARTHEST_M:
         raise PoseError("it lies outside of the map, and of what a map can be")
-    grid, heading = in_grid(frame, T_map_base[:3, 3], yaw)
+    grid, heading = _in_grid(frame, T_map_base[:3, 3], yaw)
     turn = heading - yaw
     R = np.array([[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     covariance = R @ covariance @ R.T
@@ -95,10 +95,15 @@ def heading_prior(
     if R_world_base[2, 2] < LEVEL_COSINE:
         raise PoseError("the orientation says that the robot lies on its side")
     yaw = math.atan2(R_world_base[1, 0], R_world_base[0, 0]) + offset_rad
-    _, heading = in_grid(frame, np.zeros(3), yaw)
+    _, heading = _in_grid(frame, np.zeros(3), yaw)
     told = float(imu.orientation_covariance[8])
     variance = max(std_rad**2, told if math.isfinite(told) else 0.0)
     return PosePrior(None, heading, np.diag([math.inf, math.inf, variance]), stamp_of(imu))
+
+
+def _in_grid(frame: MapFrame, enu: Float64Array, yaw_rad: float) -> tuple[Float64Array, float]:
+    grid, heading = in_grid(frame, enu[None], np.array([yaw_rad]))
+    return grid[0], float(heading[0])
 
 
 def _map_covariance(covariance: Float64Array, R_map_frame: Float64Array) -> Float64Array:

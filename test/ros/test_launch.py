@@ -69,8 +69,10 @@ def started_with(launch_file: dict[str, Any], **given: str) -> dict[str, Any]:
 
 
 def test_arguments_reach_the_node_and_parameters_that_exist(launch_file: dict[str, Any]) -> None:
-    node = started_with(launch_file, map="/maps/a", use_sim_time="true", autostart="false", points="/lidar")
-    assert ("points", "/lidar") in node["remappings"]
+    node = started_with(
+        launch_file, map="/maps/a", use_sim_time="true", autostart="false", points="/lidar", odom="/wheels"
+    )
+    assert {("points", "/lidar"), ("odom", "/wheels"), ("initialpose", "/initialpose")} <= set(node["remappings"])
     file, settings = node["parameters"]
     assert file == "/share/crossloc3d_ros/config/localizer.yaml"
     assert settings == {"map": "/maps/a", "use_sim_time": True, "autostart": False}

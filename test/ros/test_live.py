@@ -13,7 +13,9 @@ from crossloc3d_ros.evaluation.estimates import read_estimates
 from crossloc3d_ros.formats import bag
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.ros.conversions import in_grid
 from crossloc3d_ros.ros.live import header_stamp_ns, localize_live
+from crossloc3d_ros.types import TrackState
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 250_000_000
@@ -23,6 +25,11 @@ SCANS = 12
 def write_drive(path: Path, world: Any) -> Path:
     with bag.BagWriter(path) as writer:
         writer.add_topic("/lidar/points", bag.POINT_CLOUD, bag.OfferedQos("best_effort", "volatile", 5))
+        for tick in range(SCANS * STEP_NS // 50_000_000):
+            stamp_ns = START_NS + tick * 50_000_000
+            place = (0.1 * tick, 0.0, 0.0)
+            odometry = bag.odometry(stamp_ns, "wheels", "base_link", place, (0.0, 0.0, 0.0, 1.0))
+            writer.write("/wheels", bag.ODOMETRY, stamp_ns, odometry)
         for place in range(SCANS):
             stamp_ns = START_NS + place * STEP_NS
             points = world.points(place) if place != 5 else np.full((100, 3), np.nan)
@@ -42,7 +49,9 @@ def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, 
             world.map_path,
             frame,
             tmp_path / "estimates.csv",
+            odometry_topic="/wheels",
             parameters=parameters,
+            program=(str(Path(__file__).with_name("standin.py")),),
             log_path=tmp_path / "localizer.log",
             domain=domain,
             progress=lambda done, total, _: calls.append((done, total)),
@@ -64,9 +73,22 @@ def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, 
         np.testing.assert_allclose(table.candidate_grid[i, 0], world.grid(i)[:2], atol=0.05)
         assert table.candidate_probabilities[i, 0] > table.candidate_probabilities[i, 1]
         if table.has_fix[i]:
-            assert np.hypot(*(table.grid[i, :2] - world.grid(i)[:2])) < 60.0
-            assert table.covariance[i, 0, 0] > 0
-            assert table.reasons[i]
+            # The stand-in puts the robot 3 m east and 2 m south of the place, and turns it by half a radian.
+            made_up = np.array(world.grid(i)[:2]) + np.array([3.0, -2.0])
+            np.testing.assert_allclose(table.grid[i, :2], made_up, atol=0.01)
+            assert table.covariance[i, 0, 0] == pytest.approx(0.04)
+            assert table.states[i] is TrackState.LOCALIZED
+            assert table.probability[i] > 0.7
+            _, heading = in_grid(frame, np.zeros((1, 3)), table.heading_rad[i : i + 1])
+            assert heading[0] == pytest.approx(0.5, abs=1e-3)
+            assert np.degrees(table.heading_std_rad[i]) == pytest.approx(np.degrees(0.01), abs=0.01)
+            np.testing.assert_allclose(table.hypotheses.grid[i, 0], made_up, atol=0.02)
+            np.testing.assert_allclose(table.hypotheses.probabilities[i, :2], [0.9, 0.06])
+            np.testing.assert_allclose(table.aligned.grid[i, 0], made_up, atol=0.02)
+            np.testing.assert_allclose(table.aligned.heading_rad[i, 0], 0.5, atol=1e-3)
+            assert table.aligned_sources[i, 0] == 0
+    moved = [reason for reason in table.reasons if "moved 0.50 0.00 0.000" in reason]
+    assert len(moved) >= SCANS - 5, "the odometry reaches the localizer"
     for i in np.flatnonzero(~answered):
         assert "no answer" in table.reasons[i]
 

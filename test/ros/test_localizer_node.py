@@ -31,7 +31,8 @@ from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.ros.conversions import header_message, in_grid, in_map, matrix_from_transform
+from crossloc3d_ros.ros import conversions
+from crossloc3d_ros.ros.conversions import header_message, in_map, matrix_from_transform
 
 if TYPE_CHECKING:
     from conftest import NodeProcess, Robot, StartNode, World
@@ -61,6 +62,11 @@ def active(localizer: NodeProcess, robot: Robot) -> Robot:
     robot.wait_for_localizer()
     robot.forget()
     return robot
+
+
+def in_grid(frame: MapFrame, enu: np.ndarray, yaw: float) -> tuple[np.ndarray, float]:
+    grid, heading = conversions.in_grid(frame, enu[None], np.array([yaw]))
+    return grid[0], float(heading[0])
 
 
 def frame_of(world: World) -> MapFrame:

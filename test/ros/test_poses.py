@@ -27,13 +27,13 @@ from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.localization.odometry import OdometryBuffer
+from crossloc3d_ros.ros import conversions
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,
     candidates_message,
     fix_message,
     header_message,
     hypotheses_message,
-    in_grid,
     in_map,
     markers_message,
     pose_of_matrix,
@@ -53,6 +53,11 @@ STAMP_NS = 1_700_000_000_000_000_000
 
 angles = st.floats(-3.1, 3.1)
 metres = st.floats(-900.0, 900.0)
+
+
+def in_grid(frame: MapFrame, enu: np.ndarray, yaw: float) -> tuple[np.ndarray, float]:
+    grid, heading = conversions.in_grid(frame, enu[None], np.array([yaw]))
+    return grid[0], float(heading[0])
 
 
 def pose_message(T: np.ndarray, covariance: np.ndarray) -> PoseWithCovariance:
