@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from crossloc3d_ros.evaluation import charts
 from crossloc3d_ros.evaluation.estimates import EstimateTable
 from crossloc3d_ros.evaluation.recall import RANKS, Scores, horizontal_distances, submaps_within
-from crossloc3d_ros.evaluation.track_scores import SIGMAS, WRONG_M, TrackScores, contents
+from crossloc3d_ros.evaluation.track_scores import SIGMAS, WRONG_M, TrackScores, believed_error_m, contents
 from crossloc3d_ros.evaluation.wording import count, percent
 from crossloc3d_ros.types import Float64Array, TrackState
 
@@ -198,9 +198,8 @@ def _belief_chart(table: EstimateTable, chosen: list[int]) -> str:
         height=210.0,
     )
     doubt = -np.log10(np.clip(1.0 - table.probability, 10.0**-chart.y.high, 1.0))
-    right = table.error_m < WRONG_M
-    known = np.isfinite(table.truth_grid).all(axis=1)
-    css = ["right" if right[i] else "unscored" if not known[i] else "wrong" for i in chosen]
+    off_m = believed_error_m(table)
+    css = ["right" if off_m[i] < WRONG_M else "wrong" if math.isfinite(off_m[i]) else "unscored" for i in chosen]
     marks = [chart.dots(seconds[chosen], doubt[chosen], css, 2.0)]
     return f'<div class="scroll">{chart.render(marks, "beliefs", "timeline")}</div>' + (
         f'<p class="below"><span>Belief that the error is below {WRONG_M:g} m, fix or not</span>'

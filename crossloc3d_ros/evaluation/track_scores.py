@@ -200,10 +200,22 @@ def coverage(table: EstimateTable) -> tuple[Coverage, ...]:
     return tuple(rows)
 
 
+def believed_error_m(table: EstimateTable) -> Float64Array:
+    """Return how far off (S,) the place is that `probability` speaks of, fix or not; NaN where there is none.
+
+    Over ROS a place comes with a fix alone; without one it is that of the likeliest hypothesis.
+    """
+    place = table.grid[:, :2]
+    if table.hypotheses.grid.shape[1]:
+        place = np.where(np.isfinite(place), place, table.hypotheses.grid[:, 0])
+    return np.asarray(np.hypot(*(place - table.truth_grid).T))
+
+
 def beliefs(table: EstimateTable, borders: Sequence[float] = BELIEFS) -> tuple[BeliefRange, ...]:
     """Return for ranges of believed probability, fix or not, how often the error was below `WRONG_M`."""
-    known = np.isfinite(table.probability) & np.isfinite(table.truth_grid).all(axis=1)
-    right = table.error_m < WRONG_M  # no place at all is not right
+    off_m = believed_error_m(table)
+    known = np.isfinite(table.probability) & np.isfinite(off_m)
+    right = off_m < WRONG_M
     rows = []
     for low, high in pairwise(borders):
         last = high == borders[-1]

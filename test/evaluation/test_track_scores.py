@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from crossloc3d_ros.evaluation import track_scores
-from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
+from crossloc3d_ros.evaluation.estimates import EstimateTable, PoseLists, no_pose_lists
 from crossloc3d_ros.types import TrackState
 
 WEST, SOUTH = 628_000.0, 5_803_000.0
@@ -98,15 +99,28 @@ def test_beliefs_are_counted_by_range_whether_or_not_there_was_a_fix() -> None:
     scans = 400
     probability = np.tile([0.0, 0.005, 0.95, 0.9999], 100)
     offsets = np.zeros((scans, 2))
-    offsets[0::4] = [np.nan, np.nan]  # no place at all is not right
+    offsets[0::4] = [np.nan, np.nan]  # no place at all is neither right nor wrong
     offsets[1::4] = [50.0, 0.0]
     offsets[2::40] = [50.0, 0.0]  # ten of the hundred that are believed by 95 %
     table = drive(offsets, has_fix=np.tile([False, False, False, True], 100), probability=probability)
     rows = track_scores.beliefs(table)
-    assert [(row.low, row.scans) for row in rows] == [(0.0, 200), (0.9, 100), (0.999, 100)]
+    assert [(row.low, row.scans) for row in rows] == [(0.0, 100), (0.9, 100), (0.999, 100)]
     assert [row.right.value for row in rows] == [0.0, 0.9, 1.0]
     assert rows[2].mean_belief == pytest.approx(0.9999)
     assert rows[1].right.low < 0.6  # 200 m of way are eight places, not a hundred
+
+
+def test_without_a_fix_the_belief_is_that_in_the_likeliest_hypothesis() -> None:
+    """So it comes over ROS, where a pose is published with a fix alone."""
+    offsets = np.full((4, 2), np.nan)
+    table = drive(offsets, has_fix=[False] * 4, probability=np.full(4, 0.6))
+    held = np.stack([table.truth_grid + [3.0, 0.0], table.truth_grid], axis=1)
+    held[3, 0] += 500.0
+    rest = np.zeros((4, 2))
+    poses = PoseLists(held, rest, np.zeros((4, 2, 2, 2)), rest, np.tile([0.6, 0.2], (4, 1)))
+    (row,) = track_scores.beliefs(replace(table, hypotheses=poses))
+    assert (row.scans, row.right.value) == (4, 0.75)
+    assert track_scores.beliefs(table) == ()
 
 
 def test_a_search_lasts_until_the_first_right_fix() -> None:
