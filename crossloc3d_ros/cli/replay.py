@@ -41,7 +41,7 @@ from crossloc3d_ros.evaluation.replay import (
     write_summary,
 )
 from crossloc3d_ros.evaluation.report import About, write_report
-from crossloc3d_ros.evaluation.track_scores import TrackScores
+from crossloc3d_ros.evaluation.track_scores import LOST, TrackScores
 from crossloc3d_ros.evaluation.truth import find_truth_topic
 from crossloc3d_ros.evaluation.wording import degrees, metres, percent
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
@@ -282,8 +282,13 @@ def print_results(evaluation: Evaluation, target: Console) -> None:
 def _add_track(figures: Table, track: TrackScores) -> None:
     """Add the rows of a pose that was followed."""
     for search in track.searches:
-        found = f"after {metres(search.travelled_m)} and {search.seconds:.1f} s"
-        figures.add_row(f"localized, {search.cause}", found if search.end is not None else "never")
+        if search.cause != LOST:
+            found = f"after {metres(search.travelled_m)} and {search.seconds:.1f} s"
+            figures.add_row(f"localized, {search.cause}", found if search.end is not None else "never")
+    lost = [search.travelled_m for search in track.searches if search.cause == LOST]
+    if lost:
+        longest = f", {metres(max(lost))} at most" if len(lost) > 1 else ""
+        figures.add_row("afterwards without a fix", f"{len(lost)} times, {metres(sum(lost))} in all{longest}")
     errors = track.errors
     if errors.count:
         figures.add_row("error of a fix", f"median {metres(errors.median_m)}, 95 % {metres(errors.p95_m)}")

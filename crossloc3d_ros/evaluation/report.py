@@ -18,7 +18,7 @@ from crossloc3d_ros.evaluation.estimates import EstimateTable, wrapped, write_at
 from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS, Scores, horizontal_distances
 from crossloc3d_ros.evaluation.replay import Evaluation
 from crossloc3d_ros.evaluation.replay_map import draw_map, grid_turn_rad, legend, page_data
-from crossloc3d_ros.evaluation.track_scores import WRONG_M, Search, TrackScores
+from crossloc3d_ros.evaluation.track_scores import CARRIED, FROM_NOTHING, LOST, WRONG_M, Search, TrackScores
 from crossloc3d_ros.evaluation.truth import TruthTrack
 from crossloc3d_ros.evaluation.wording import count, degrees, finite, interval, metres, percent
 from crossloc3d_ros.geodesy import MapFrame
@@ -26,6 +26,8 @@ from crossloc3d_ros.places.store import AerialMap
 
 _MOST_SCANS = 3000
 """A longer drive is thinned evenly on the page, not in the figures."""
+_MOST_SEARCHES = 8
+"""Of the times when it was lost, the longest are listed."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def _track_verdict(table: EstimateTable, track: TrackScores) -> str:
         text += "It never found out where it was. "
     elif first is not None:
         text += f"It knew its place after <b>{metres(first.travelled_m)}</b> and {first.seconds:.1f} s. "
-    for search in (s for s in track.searches if s.cause == "carried away"):
+    for search in (s for s in track.searches if s.cause == CARRIED):
         text += (
             "Carried away, it never found its place again. "
             if search.end is None
@@ -146,7 +148,7 @@ def _wrong_words(track: TrackScores) -> str:
 
 
 def _from_nothing(track: TrackScores) -> Search | None:
-    return next((search for search in track.searches if search.cause == "from nothing"), None)
+    return next((search for search in track.searches if search.cause == FROM_NOTHING), None)
 
 
 def _track_tiles(track: TrackScores) -> list[tuple[str, str, str]]:
@@ -189,18 +191,22 @@ def _track_sections(table: EstimateTable, track: TrackScores, frame: MapFrame) -
 
 
 def _search_table(track: TrackScores) -> str:
+    longest = sorted((s.travelled_m for s in track.searches if s.cause == LOST), reverse=True)[:_MOST_SEARCHES]
+    shown = [s for s in track.searches if s.cause != LOST or s.travelled_m >= longest[-1]]
     rows = []
-    for search in track.searches:
+    for search in shown:
         rows.append(
             f"<tr><th scope='row'>{escape(search.cause)}<small>at {search.start_s:.1f} s, scan {search.start + 1:,}"
             f"</small></th><td><b>{metres(search.travelled_m)}</b></td><td>{search.seconds:.1f} s</td>"
             f"<td>{'found' if search.end is not None else 'not found'}</td>"
             f"<td>{search.wrong_fixes:,}</td></tr>"
         )
-    short = ""
+    short = (
+        f" {len(track.searches) - len(shown):,} shorter ones are left out." if len(shown) < len(track.searches) else ""
+    )
     if track.short_gaps:
         are = "is" if track.short_gaps == 1 else "are"
-        short = f" {count(track.short_gaps, 'gap')} of less than 5 m between right fixes {are} not listed."
+        short += f" {count(track.short_gaps, 'gap')} of less than 5 m between right fixes {are} not listed."
     return (
         '<div class="scroll"><table class="recall"><thead><tr><th scope="col">Stretch without a right fix</th>'
         '<th scope="col">driven</th><th scope="col">time</th><th scope="col">how it ended</th>'

@@ -23,6 +23,7 @@ WRONG_M = 10.0
 SIGMAS = (1.0, 2.0, 3.0)
 BELIEFS = (0.0, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)
 """Borders of the ranges of belief for which it is counted how often it was right."""
+FROM_NOTHING, CARRIED, LOST = "from nothing", "carried away", "lost"
 _SHORT_M = 5.0
 """A gap between right fixes that is shorter than this is counted, not listed."""
 
@@ -80,7 +81,7 @@ class Search:
     seconds: float
     travelled_m: float
     cause: str
-    """`from nothing`, `carried away` or `lost`."""
+    """`FROM_NOTHING`, `CARRIED` or `LOST`."""
     wrong_fixes: int
     """Fixes given meanwhile: wrong by more than `WRONG_M`."""
 
@@ -240,22 +241,22 @@ def find_searches(table: EstimateTable, way_m: Float64Array, carried: BoolArray)
     searches: list[Search] = []
     short = 0
     start: int | None = None
-    cause = "from nothing"
+    cause = FROM_NOTHING
     for i in np.flatnonzero(known).tolist():
         if carried[i]:
             if start is not None and start != i:
                 searches.append(_search(table, way_m, seconds, start, i, cause, ended=False))
-            start, cause = i, "carried away"
+            start, cause = i, CARRIED
         elif start is None and not right[i]:
             start = i
-            cause = "lost" if searches or right[:i].any() else "from nothing"
+            cause = LOST if searches or right[:i].any() else FROM_NOTHING
         if right[i]:
             if start is None and not searches:
                 start = i  # the very first scan was answered rightly
-                cause = "from nothing"
+                cause = FROM_NOTHING
             if start is not None:
                 search = _search(table, way_m, seconds, start, i, cause, ended=True)
-                if cause == "lost" and search.travelled_m < _SHORT_M:
+                if cause == LOST and search.travelled_m < _SHORT_M:
                     short += 1
                 else:
                     searches.append(search)

@@ -114,7 +114,7 @@ def test_without_a_fix_the_belief_is_that_in_the_likeliest_hypothesis() -> None:
     """So it comes over ROS, where a pose is published with a fix alone."""
     offsets = np.full((4, 2), np.nan)
     table = drive(offsets, has_fix=[False] * 4, probability=np.full(4, 0.6))
-    held = np.stack([table.truth_grid + [3.0, 0.0], table.truth_grid], axis=1)
+    held = np.stack([table.truth_grid + np.array([3.0, 0.0]), table.truth_grid], axis=1)
     held[3, 0] += 500.0
     rest = np.zeros((4, 2))
     poses = PoseLists(held, rest, np.zeros((4, 2, 2, 2)), rest, np.tile([0.6, 0.2], (4, 1)))
