@@ -228,15 +228,16 @@ def read_settings(texts: Sequence[str]) -> dict[str, Any]:
 
 def pose_tables(scores: PoseScores) -> list[Table]:
     """Return what the terminal shows of poses: the table of goals, and what each stage brings."""
-    marks = {"goal": "goal", "floor": "floor", "below": "below", "": ""}
-    table = _table(f"Poses, {scores.about.pose_set}", ["", "measured", "95 %", "floor", "goal", "", "of"])
+    marks = {"goal": "✓ ", "floor": "– ", "below": "✗ ", "": ""}
+    table = _table(f"Poses, {scores.about.pose_set}", ["", "measured", "95 %", "floor", "goal", "of"])
+    table.columns[0].min_width = 22
+    table.columns[0].overflow = "fold"
+    table.caption = "✓ goal, – floor, ✗ neither; ∞: not within the drive"
     for each in scores.measures:
         floor = pose_results.wanted(each, each.floor, each.floor_high)
         goal = pose_results.wanted(each, each.goal, each.goal_high)
-        table.add_row(
-            each.text, pose_results.shown(each), pose_results.interval_of(each), floor, goal, marks[each.verdict],
-            f"{each.count:,}",
-        )  # fmt: skip
+        measured = marks[each.verdict] + pose_results.shown(each)
+        table.add_row(each.text, measured, pose_results.interval_of(each), floor, goal, f"{each.count:,}")
     shown = [table]
     for title, stages in (("Single scans", scores.stages), ("Scans along drives", scores.drive_stages)):
         part = _table(title, ["", "scans", "2 m and 5°, %", "10 m", "50 m", "median, m"])

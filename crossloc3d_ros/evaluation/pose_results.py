@@ -18,12 +18,12 @@ _COLUMNS = (
 
 
 def shown(measure: Measure, value: float | None = None) -> str:
-    """Return a measure's value, or another in its unit, for people."""
+    """Return a measure's value, or another in its unit, for people; ∞ is what did not happen within the drive."""
     number = measure.value if value is None else value
     if math.isnan(number):
         return "–"
     if math.isinf(number):
-        return "not within the drive"
+        return "∞"
     if measure.unit == "%":
         return f"{_digits(100 * number)} %"
     if measure.unit == "fixes":
@@ -53,11 +53,12 @@ def interval_of(measure: Measure) -> str:
 
 def wanted(measure: Measure, low: float | None, high: float | None) -> str:
     """Return a floor or goal of a measure for people; empty where there is none."""
-    if low is None or math.isinf(low):
+    if low is None:
         return ""
-    if high is not None:
-        return f"{shown(measure, low)[:-2]}–{shown(measure, high)}"
-    return shown(measure, low)
+    unit = {"degrees": "°", "fixes": ""}.get(measure.unit, f" {measure.unit}")
+    factor = 100.0 if measure.unit == "%" else 1.0
+    ends = [f"{factor * end:g}" for end in (low, high) if end is not None]
+    return f"{'–'.join(ends)}{unit}"
 
 
 def as_markdown(scores: PoseScores) -> str:

@@ -59,9 +59,11 @@ class Measure:
     @property
     def verdict(self) -> Literal["goal", "floor", "below", ""]:
         """Say which of goal and floor the value reaches; empty where there is neither."""
-        if self.goal is None or self.floor is None or math.isnan(self.value):
+        if self.goal is None or math.isnan(self.value):
             return ""
         for name, low, high in (("goal", self.goal, self.goal_high), ("floor", self.floor, self.floor_high)):
+            if low is None:
+                continue
             if high is not None:
                 reached = low <= self.value <= high
             else:
@@ -279,7 +281,7 @@ def quantile_interval(values: Float64Array, clusters: Int64Array, q: float) -> t
 class _Goals:
     """What is wanted of each measure: floor, goal, and the upper ends where they are ranges."""
 
-    wanted: dict[str, tuple[float, float, float | None, float | None, bool]]
+    wanted: dict[str, tuple[float | None, float, float | None, float | None, bool]]
 
     def measure(
         self, key: str, text: str, unit: Unit, value: float, low: float, high: float, count: int, counted: str
@@ -295,9 +297,9 @@ def _goals(about: PoseAbout) -> _Goals:
     at_least: dict[str, tuple[float, float]] = {"end_to_end": (0.60, 0.90) if real else (0.80, 0.97)}
     if not real:
         at_least["among"] = (0.95, 0.995)
-    at_most = {
+    at_most: dict[str, tuple[float | None, float]] = {
         "until_median": (60.0, 15.0),
-        "until_95": (math.inf, 60.0),
+        "until_95": (None, 60.0),
         "after_median": (1.0, 0.3),
         "after_95": (3.0, 1.0),
         "heading_median": (1.0, 0.3),
