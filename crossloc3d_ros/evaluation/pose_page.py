@@ -194,8 +194,8 @@ def _words(scores: PoseScores, words: Sequence[str]) -> str:
         f"<h3>Drives</h3><p>Localized is a robot at its first fix that is right to {WRONG_M:g} m; a drive on which "
         "that does not happen counts as infinitely long (∞). Errors afterwards are those of all fixes from then on, "
         "right ones and wrong ones. Then it is carried to another town while its wheels stand still, and nobody tells "
-        "it. Wrong fixes are counted over everything: before, afterwards, while carried, and off the map, where every fix "
-        "is wrong.</p>",
+        "it. Wrong fixes are counted over everything: before, afterwards, while carried, and off the map, where every "
+        "fix is wrong.</p>",
         "<h3>Two sigma</h3><p>The ellipse of the stated covariance that holds 95.4 % of an honest estimate's errors. "
         "The dashed lines are what honest covariances would show.</p>",
         "<h3>Stages</h3><p>“Retrieval alone” is the first candidate's centre, which has no heading. “+ alignment” is "
