@@ -23,7 +23,7 @@ WRONG_M = 10.0
 SIGMAS = (1.0, 2.0, 3.0)
 BELIEFS = (0.0, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)
 """Borders of the ranges of belief for which it is counted how often it was right."""
-FROM_NOTHING, CARRIED, LOST = "from nothing", "carried away", "lost"
+FROM_NOTHING, CARRIED, LOST = "from nothing", "carried away", "in between"
 _SHORT_M = 5.0
 """A gap between right fixes that is shorter than this is counted, not listed."""
 

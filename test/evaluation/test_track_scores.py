@@ -146,8 +146,8 @@ def test_gaps_are_listed_where_the_robot_drove_on() -> None:
     assert scores is not None
     assert [(s.cause, s.start, s.end) for s in scores.searches] == [
         ("from nothing", 0, 0),
-        ("lost", 50, 70),
-        ("lost", 90, None),
+        ("in between", 50, 70),
+        ("in between", 90, None),
     ]
     assert scores.short_gaps == 1
 
