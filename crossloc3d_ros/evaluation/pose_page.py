@@ -166,8 +166,29 @@ def _belief_charts(scores: PoseScores) -> str:
         keys.append(f'<span><i class="key stroke k-{number + 2}"></i>{escape(name)}, fixes once localized</span>')
     return (
         f'<div class="pair"><div>{belief.render(marks)}</div><div>{sigma.render(inside)}</div></div>'
-        f'<p class="below">{"".join(keys)}</p>'
+        f'<p class="below">{"".join(keys)}</p>{_belief_tables(scores)}'
     )
+
+
+def _belief_tables(scores: PoseScores) -> str:
+    """Return what the chart has no room for: the beliefs near to certainty."""
+    tables = []
+    for each in scores.calibrations:
+        rows = "".join(
+            f"<tr><td>{_fine_percent(believed)}</td><td>{_fine_percent(right)}</td><td>{count:,}</td></tr>"
+            for believed, right, count in zip(each.believed, each.right, each.count, strict=True)
+        )
+        tables.append(
+            f'<div class="scroll"><table class="recall beliefs"><caption>{escape(each.name)}</caption><thead><tr>'
+            "<th scope='col'>believed</th><th scope='col'>right</th><th scope='col'>scans</th></tr></thead>"
+            f"<tbody>{rows}</tbody></table></div>"
+        )
+    return f'<div class="pair">{"".join(tables)}</div>'
+
+
+def _fine_percent(share: float) -> str:
+    """Return a share with the digits that tell 99.9 from 99.99 %."""
+    return f"{100 * share:.3g} %" if share < 0.99 else f"{100 * share:.2f} %"
 
 
 def _families(measures: Sequence[Measure]) -> str:

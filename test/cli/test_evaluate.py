@@ -16,7 +16,10 @@ import pytest
 from crossloc3d_ros.cli import evaluate
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.evaluation import benchmark as benchmarks
+from crossloc3d_ros.evaluation import pose_drives, pose_sets
 from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
+from crossloc3d_ros.evaluation.pose_drives import DrivePlan
+from crossloc3d_ros.evaluation.pose_sets import SimulatedPoses
 from crossloc3d_ros.evaluation.predictions import load_predictions
 from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS, write_cloud
@@ -191,3 +194,80 @@ def test_amsterdam_is_made_of_the_two_surveys(weights: Path, tmp_path: Path, mon
     assert set(groups) == {"the demo's drive", "all streets"}
     assert groups["the demo's drive"] >= 9
     assert np.isfinite([float(row["recall"]) for row in rows if row["counted"] != "0"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--protocol", "pose", "--dataset", "data"], "knows neither"),
+        (["--protocol", "pose", "--method", "scan_context"], "knows neither"),
+        (["--protocol", "pose", "--workers", "0"], "at least 1"),
+        (["--protocol", "pose", "--set", "fusion"], "NAME=VALUE"),
+        (["--protocol", "pose", "--set", "fusion.nonsense=1"], "unknown setting 'fusion.nonsense'"),
+        (["--protocol", "pose", "--set", "fusion.min_probability=2"], "must lie between"),
+        (["--protocol", "pose", "--set", "top_k=5", "--set", "top_k.x=1"], "was given a value before"),
+        (["--protocol", "pose", "--only-score"], "without --only-score"),
+        (["--protocol", "place", "--set", "top_k=5"], "add --protocol pose"),
+    ],
+)
+def test_options_of_the_other_protocol_are_refused(
+    options: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate.main([*options, "--output", str(tmp_path / "out"), "--data", str(tmp_path / "data")]) == 2
+    assert complaint in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "data").exists()
+
+
+def test_settings_are_read_as_groups() -> None:
+    read = evaluate.read_settings(
+        ["top_k=5", "fusion.min_probability=0.9", "scan.mounting.z_m=1.5", "fusion.forget_s=2"]
+    )
+    assert read == {
+        "top_k": 5, "fusion": {"min_probability": 0.9, "forget_s": 2}, "scan": {"mounting": {"z_m": 1.5}},
+    }  # fmt: skip
+
+
+def test_a_benchmark_of_poses_has_no_places(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "--weights",
+        str(weights),
+        "--benchmark",
+        "fitting",
+        "--output",
+        str(tmp_path),
+        "--data",
+        str(tmp_path),
+    ]
+    assert evaluate.main(arguments) == 2
+    assert "--protocol pose" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_poses_are_asked_written_and_scored_again(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = BenchmarkTown("suburb", 990_021, False)
+    town = SimulatedPoses(
+        SimulatedBenchmark((one,), 260.0, 3, 0, flight=SurveyConfig(spacing_m=0.8), build=BuildConfig(spacing_m=38.0)),
+        columns=1, off_map=(BenchmarkTown("campus", 990_022, False),), off_map_scans=2,
+    )  # fmt: skip
+    plans = tuple(DrivePlan(f"drive {i}", i, 40.0, 2.5, 5, i, True, 1.2, 0.0) for i in range(2))
+    arguments = [
+        "--protocol", "pose", "--weights", str(weights), "--benchmark", "simulated_small", "--workers", "2",
+        "--set", "fusion.min_probability=0.9", "--data", str(tmp_path / "data"), "--output", str(tmp_path / "out"),
+    ]  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(pose_sets.POSE_SETS, "simulated_small", town)
+        patch.setattr(pose_drives, "drive_plans", lambda _: plans)
+        assert evaluate.main(arguments) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["about"]["config"]["fusion"]["min_probability"] == 0.9
+    rows = {row["measure"]: row for row in results["table"]}
+    assert rows["end_to_end"]["count"] == 3
+    assert rows["until_median"]["count"] == 1
+    before = (tmp_path / "out" / "results.csv").read_text()
+    shutil.rmtree(tmp_path / "data")
+    assert evaluate.main([*arguments, "--only-score"]) == 0
+    assert (tmp_path / "out" / "results.csv").read_text() == before
+    assert (tmp_path / "out" / "index.html").stat().st_size > 10_000
+    assert "Single scans" in capsys.readouterr().out
