@@ -41,7 +41,7 @@ from crossloc3d_ros.types import DescriptorEncoder, Estimate, FixStatus
 MAP_SURVEY, DRIVE_SURVEY = "ahn2_2010.laz", "ahn3_2014.laz"
 # Ellipsoidal height minus NAP in Amsterdam, rounded to the metre.
 GEOID_SEPARATION_M = 43.0
-TOPIC = "/velodyne_points"
+TOPIC, ODOMETRY_TOPIC = "/velodyne_points", "/odom"
 _SHOWN_EVERY_S = 5.0
 
 
@@ -115,6 +115,7 @@ def _demo(arguments: argparse.Namespace) -> None:
             map_folder,
             aerial_map.frame,
             output / ESTIMATES,
+            odometry_topic=ODOMETRY_TOPIC,
             parameters=parameters,
             log_path=log_path,
             on_started=lambda s: target.print(f"up and warm after {s:.1f} s; playing {seconds:.0f} s in real time"),

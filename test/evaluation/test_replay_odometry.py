@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,22 @@ import pytest
 from crossloc3d_ros.config import LocalizerConfig, MountingConfig, ScanConfig
 from crossloc3d_ros.errors import BagError
 from crossloc3d_ros.evaluation.estimates import read_estimates
-from crossloc3d_ros.evaluation.replay import HELD_NS, OdometrySource, localize_bag
+from crossloc3d_ros.evaluation.replay import (
+    ESTIMATES,
+    HELD_NS,
+    SUMMARY,
+    OdometrySource,
+    evaluate,
+    localize_bag,
+    write_summary,
+)
+from crossloc3d_ros.evaluation.report import About, write_report
 from crossloc3d_ros.formats import bag
+from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.localization.odometry import Motion
-from crossloc3d_ros.types import Estimate, Float64Array, Scan
+from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.types import Estimate, FixStatus, Float64Array, Scan, TrackState
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -223,3 +235,74 @@ def test_scans_tell_the_motion_themselves(tmp_path: Path) -> None:
     assert last is not None
     assert last.is_known
     np.testing.assert_allclose(last.delta, [1.0, 0.0, 0.0], atol=0.08)
+
+
+class Oracle(Listener):
+    """Stands in for a localizer that is 0.3 m and 2 degrees off all the time."""
+
+    def __init__(self, frame: MapFrame, truth: dict[int, tuple[float, float, float]]) -> None:
+        super().__init__()
+        self.frame, self.truth = frame, truth
+
+    def localize(
+        self,
+        scan: Scan,
+        gravity_base: Float64Array | None = None,
+        T_base_lidar: Float64Array | None = None,
+        motion: Motion | None = None,
+    ) -> Estimate:
+        easting, northing, yaw = self.truth[scan.stamp_ns]
+        grid = np.array([easting + 0.3, northing, 0.0])
+        latitude, longitude, altitude = self.frame.to_geographic(grid[None])
+        yaw += np.radians(2.0)
+        T_map_base = np.eye(4)
+        T_map_base[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        return replace(
+            no_estimate(scan.stamp_ns, "stand-in"),
+            status=FixStatus.FIX,
+            grid=grid,
+            latitude_deg=float(latitude[0]),
+            longitude_deg=float(longitude[0]),
+            altitude_m=float(altitude[0]),
+            covariance=np.eye(3) * 0.04,
+            state=TrackState.LOCALIZED,
+            probability=0.9995,
+            T_map_base=T_map_base,
+            pose_covariance=np.diag([0.04, 0.04, 1.0, 1e-3, 1e-3, np.radians(1.5) ** 2]),
+        )
+
+
+def test_poses_are_held_against_the_true_ones_of_the_recording(town_map: AerialMap, tmp_path: Path) -> None:
+    frame = town_map.frame
+    west, south, _, _ = town_map.bounds
+    messages: list[tuple[str, str, int, Any]] = []
+    truth = {}
+    for i in range(20):
+        stamp = START + i * SECOND // 5
+        yaw = 3.0 + 0.02 * i  # across the seam at half a turn
+        place = np.array([[west + 150.0 - 4.0 * i, south + 80.0, 2.0]])
+        truth[stamp] = (place[0, 0], place[0, 1], yaw)
+        latitude, longitude, _ = frame.to_geographic(place)
+        fix = bag.nav_sat_fix(stamp, "base_link", latitude[0], longitude[0], float("nan"), np.zeros((3, 3)))
+        messages.append(("/ground_truth/fix", bag.NAV_SAT_FIX, stamp, fix))
+        x, y, _ = frame.to_enu(place)[0]
+        message = bag.odometry(stamp, "world", "base_link", (x, y, 0), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)))
+        messages.append(("/ground_truth/odom", bag.ODOMETRY, stamp, message))
+        messages.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
+    with bag.open_bag(record(tmp_path / "drive", messages)) as reader:
+        localize_bag(reader, "/points", Oracle(frame, truth), tmp_path / ESTIMATES)  # type: ignore[arg-type]
+        evaluation = evaluate(reader, tmp_path, town_map)
+    assert evaluation.heading_topic == "/ground_truth/odom"
+    np.testing.assert_allclose(np.degrees(evaluation.table.heading_error_rad), 2.0, atol=1e-3)
+    assert evaluation.track is not None
+    assert evaluation.track.errors.median_m == pytest.approx(0.3, abs=2e-3)
+    assert evaluation.track.errors.median_deg == pytest.approx(2.0, abs=1e-3)
+    one, two, _ = evaluation.track.coverage
+    assert (one.position, two.position) == (1.0, 1.0)
+    assert (one.heading, two.heading) == (0.0, 1.0)
+    write_summary(tmp_path, evaluation, {})
+    summary = json.loads((tmp_path / SUMMARY).read_text(), parse_constant=pytest.fail)
+    assert summary["track"]["errors"]["wrong"] == 0
+    assert summary["track"]["searches"][0]["cause"] == "from nothing"
+    write_report(tmp_path / "page.html", evaluation, town_map, About("A drive", {}))
+    assert "0.30 m" in (tmp_path / "page.html").read_text()
