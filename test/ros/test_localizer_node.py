@@ -8,6 +8,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -498,7 +499,8 @@ R_TILT = np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0
 
 @pytest.fixture(scope="module")
 def managed(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
-    own = {"autostart": False, "use_sim_time": True, "use_imu": True, "imu_time_constant_s": 0.01}
+    odometry = "none" if find_spec("kiss_icp") is None else "scan"
+    own = {"autostart": False, "use_sim_time": True, "use_imu": True, "imu_time_constant_s": 0.01, "odometry": odometry}
     node = start_stand_in(
         {**world.parameters(), **own, "qos_overrides./rover/lidar.subscription.reliability": "reliable"},
         "-r", "__ns:=/rover", "-r", "points:=lidar",
@@ -507,6 +509,20 @@ def managed(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
     assert node.is_alive, f"a test has ended the node:\n{node.output}"
     assert node.stop(signal.SIGTERM) == 0
     assert "Traceback" not in node.output
+
+
+def the_scans_tell_how_the_robot_moves(robot: Robot, world: World, clouds: Any) -> None:
+    states: list[DiagnosticStatus] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.node.create_subscription(DiagnosticStatus, "/rover/localizer/state", states.append, latched)
+    robot.wait_until(lambda: states, what="for the state")
+    robot.call(Empty, "/rover/reinitialize_global_localization", Empty.Request())
+    for forward_m in (0.0, 0.3, 0.7):
+        message = robot.message(world.points(7) - np.array([forward_m, 0.0, 0.0], np.float32))
+        stamp_ns = str(stamp_ns_of(message))
+        clouds.publish(message)
+        robot.wait_until(lambda told=stamp_ns: states[-1].values[0].value == told, what="for the state")
+    assert "moved 0.40" in states[-1].message
 
 
 def test_a_managed_node_in_a_namespace_levels_by_the_imu(
@@ -554,6 +570,9 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
     for _ in range(100):
         next(robot.stamps_ns)  # ten seconds: the sample is too old then to say anything
     assert with_imu < 0.7 * best_distance(None)
+
+    if find_spec("kiss_icp") is not None:
+        the_scans_tell_how_the_robot_moves(robot, world, clouds)
 
     # A driver that is best effort never reaches a reliable subscription, and the node says so.
     robot.node.create_publisher(PointCloud2, "/rover/lidar", qos_profile_sensor_data)
@@ -608,6 +627,8 @@ def truncated_map(folder: Path, world: World) -> Path:
         pytest.param({"--params-file": "BROKEN"}, "broken.yaml", marks=pytest.mark.slow),
         pytest.param({"scan.mounting.z_m": "high"}, "'scan.mounting.z_m' must be of type", marks=pytest.mark.slow),
         pytest.param({"weights": "NOWHERE"}, "no such weights file", marks=pytest.mark.slow),
+        ({"publish_tf": True, "odometry": "none"}, "publish_tf needs odometry from a topic"),
+        pytest.param({"publish_tf": True}, "publish_tf needs tf2_ros, which is not", marks=pytest.mark.slow),
         pytest.param({"mounting_from_tf": True}, "needs tf2_ros, which is not installed", marks=pytest.mark.slow),
         pytest.param(
             {"qos_overrides./points.subscription.reliability": "sometimes"}, "qos_overrides./points",
