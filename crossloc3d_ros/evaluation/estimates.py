@@ -1,9 +1,9 @@
 """Estimates on disk: written while they are made, read back to be scored, so that figures can be checked later.
 
 One CSV row a scan. Lists inside a row (candidates, aligned poses, hypotheses, best first) are separated by spaces;
-unknown numbers are empty, inside of lists `nan`. `heading_deg` and its truth are counter-clockwise from true east, as in the frame `map`; the
-`grid_headings_deg` of the lists are counter-clockwise from grid east, the axis of their eastings. Files from before
-there were poses lack columns, and are read all the same.
+unknown numbers are empty, inside of lists `nan`. `heading_deg` and its truth are counter-clockwise from true east, as
+in the frame `map`; the `grid_headings_deg` of the lists are counter-clockwise from grid east, the axis of their
+eastings. Files from before there were poses lack columns, and are read all the same.
 """
 
 from __future__ import annotations
