@@ -395,7 +395,14 @@ class LocalizerNode(LifecycleNode):
                 f"IMU: acceleration {np.round(acceleration, 2).tolist()} m/s2 is no gravity; sample left out",
                 throttle_duration_sec=REPEAT_REASON_S,
             )
-        elif self._config.use_imu_heading:
+            return
+        if acceleration[2] < 0.0:
+            self.get_logger().warning(
+                f"IMU: acceleration {np.round(acceleration, 2).tolist()} m/s2 points down: at rest it must be +9.8 "
+                "upwards, in the axes of the base (REP-145)",
+                throttle_duration_sec=REPEAT_REASON_S,
+            )
+        if self._config.use_imu_heading:
             self._heading = HeadingSample(message, R_base_imu)
 
     def _receive_initial_pose(self, message: PoseWithCovarianceStamped) -> None:

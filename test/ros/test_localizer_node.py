@@ -571,6 +571,22 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
         next(robot.stamps_ns)  # ten seconds: the sample is too old then to say anything
     assert with_imu < 0.7 * best_distance(None)
 
+    # An IMU that tells gravity where others tell what holds against it.
+    answers: list[NavSatFix] = []
+    robot.node.create_subscription(NavSatFix, "/rover/localizer/fix", answers.append, 10)
+    robot.wait_until(lambda: robot.node.count_publishers("/rover/localizer/fix"), what="for the fix")
+    robot.spin(0.3)
+    upside_down = robot.message(tilted)
+    sample = Imu(header=upside_down.header)
+    sample.linear_acceleration.z = -9.81
+    imu.publish(sample)
+    robot.spin(0.3)
+    clouds.publish(upside_down)
+    robot.wait_until(lambda: answers and answers[-1].header.stamp == upside_down.header.stamp, what="for the answer")
+    assert answers[-1].status.status == NavSatStatus.STATUS_NO_FIX
+    assert "points down: at rest it must be +9.8 upwards" in managed.output
+    assert "gravity says that the robot lies on its side" in managed.output
+
     if find_spec("kiss_icp") is not None:
         the_scans_tell_how_the_robot_moves(robot, world, clouds)
 
