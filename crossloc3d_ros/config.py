@@ -116,6 +116,27 @@ class CredibilityConfig:
 
 
 @dataclass(frozen=True)
+class AlignmentConfig:
+    """From places to poses."""
+
+    search: Literal["retrieval", "exhaustive", "auto", "off"] = option(
+        "auto",
+        "poses are sought around candidates, everywhere, or both where the map is small; or not at all",
+    )
+    exhaustive_km2: float = option(1.0, "how large a small map may be", low=0.0, high=1e6)
+    exhaustive_every_s: float = option(2.0, "the whole map is searched no more often", low=0.0, high=1e6)
+    look_every_s: float = option(1.0, "and while localized, the candidates no more often", low=0.0, high=1e6)
+    candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
+    radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
+    follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
+    peaks: int = option(32, "places of the coarse search that are looked at more closely", low=1, high=1000)
+    poses: int = option(12, "of these, how many in the finest cells", low=1, high=1000)
+    min_cells: int = option(100, "a scan that saw fewer cells says nothing", low=1, high=100_000)
+    place_m2: float = option(100.0, "area of the map that counts as one place before a scan", low=0.01, high=1e6)
+    shape_temperature: float = option(20.0, "score that makes a pose e times likelier than its neighbour", low=0.01)
+
+
+@dataclass(frozen=True)
 class FusionConfig:
     """From the aligned poses of scan after scan, and odometry, to one pose that may be driven by."""
 
@@ -128,7 +149,7 @@ class FusionConfig:
     found_share: float = option(
         0.7, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
     )
-    carried_per_s: float = option(1e-3, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
+    carried_per_s: float = option(1e-4, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
     prior_belief: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)
     error_scale: float = option(1.0, "factor on the standard deviations of aligned poses", low=0.1, high=100.0)
     error_share: float = option(
@@ -156,6 +177,7 @@ class LocalizerConfig:
     top_k: int = option(25, "candidates to retrieve", low=1, high=1000)
     scan: ScanConfig = field(default_factory=ScanConfig, metadata={"text": "use of the scan"})
     credibility: CredibilityConfig = field(default_factory=CredibilityConfig, metadata={"text": "what is believed"})
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig, metadata={"text": "from places to poses"})
     fusion: FusionConfig = field(default_factory=FusionConfig, metadata={"text": "poses over time"})
 
 

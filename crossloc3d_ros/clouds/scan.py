@@ -24,6 +24,13 @@ class PreparedScan:
     counts: ScanCounts
     reason: str
     """Empty where there is a patch, else one sentence for people."""
+    place: Float32Array
+    """(N, 3) the usable points, metres: x, y from the sensor along the robot's heading, z above the ground below them.
+    Outside of the robot's own body, as far as the sensor reaches."""
+    level_z_m: Float32Array
+    """(N,) the same points' z in the levelled base frame."""
+    sensor_height_m: float
+    """Of the sensor above the ground under the robot."""
 
 
 def prepare_scan(
@@ -59,6 +66,7 @@ def prepare_scan(
     place = points_level - np.array([sensor_level[0], sensor_level[1], 0.0], np.float32)
     half_extent_m = preprocessing.scan_half_extent_m
     reach_m = min(1.45 * half_extent_m, config.max_range_m)  # as far as the patch's corners
+    level_z = place[:, 2].copy()
     place[:, 2] = scan_heights(place, float(sensor_level[2]), reach_m=reach_m)
 
     cropped = crop_above_ground(place, half_extent_m, preprocessing)
@@ -72,7 +80,8 @@ def prepare_scan(
     )
     origin = "mean" if preprocessing.scan_origin == "mean" else "given"
     patch = patch_of_cropped(cropped, half_extent_m, preprocessing, origin=origin)  # type: ignore[arg-type]
-    return PreparedScan(patch, counts, "" if patch is not None else _why_not(counts, config, preprocessing))
+    reason = "" if patch is not None else _why_not(counts, config, preprocessing)
+    return PreparedScan(patch, counts, reason, place, level_z, float(sensor_level[2]))
 
 
 def _why_not(counts: ScanCounts, config: ScanConfig, preprocessing: PreprocessingConfig) -> str:

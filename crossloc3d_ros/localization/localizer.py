@@ -1,30 +1,37 @@
-"""The localizer: a scan in, an estimate out."""
+"""The localizer: scans in, estimates out."""
 
 from __future__ import annotations
 
-import time
+import dataclasses
 
 import numpy as np
 
-from crossloc3d_ros.clouds.scan import prepare_scan
+from crossloc3d_ros.clouds.filters import mounting_matrix
+from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import LocalizerConfig
+from crossloc3d_ros.localization.alignment import Aligner
 from crossloc3d_ros.localization.credibility import effective_calibration, judge
+from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
+from crossloc3d_ros.localization.odometry import Motion
 from crossloc3d_ros.localization.retrieval import encode_query, retrieve
+from crossloc3d_ros.localization.tracking import PosePrior, Tracker
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import (
+    AlignedPoses,
     Candidates,
     DescriptorEncoder,
     Estimate,
-    FixStatus,
     Float64Array,
+    Hypotheses,
     Scan,
-    ScanCounts,
-    Timings,
+    TrackState,
 )
+
+__all__ = ["Localizer", "no_estimate"]
 
 
 class Localizer:
-    """Tell where on an aerial map a LiDAR scan was taken, without an initial pose."""
+    """Tell where on an aerial map a LiDAR is, scan after scan, without an initial pose."""
 
     def __init__(self, aerial_map: AerialMap, encoder: DescriptorEncoder, config: LocalizerConfig) -> None:
         """Bring map and encoder together; they must belong to each other, as `AerialMap.load` ensures."""
@@ -32,47 +39,69 @@ class Localizer:
         self.encoder = encoder
         self.config = config
         self.calibration = effective_calibration(config.credibility, encoder)
+        self._aligner = None if config.alignment.search == "off" else Aligner(aerial_map, config.alignment)
+        self._tracker = Tracker(config.fusion)
+        self._looks = Looks(config.alignment.look_every_s, config.alignment.exhaustive_every_s)
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Stamp of the last scan that counted, from which the next one's motion leads; None before the first."""
+        return self._tracker.stamp_ns
 
     def localize(
-        self, scan: Scan, gravity_base: Float64Array | None = None, T_base_lidar: Float64Array | None = None
+        self,
+        scan: Scan,
+        gravity_base: Float64Array | None = None,
+        T_base_lidar: Float64Array | None = None,
+        motion: Motion | None = None,
     ) -> Estimate:
         """Return where `scan` was taken.
 
         `gravity_base` (3,) is the unit vector that points up, measured in the base frame, where an IMU gives one;
-        `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it.
+        `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it. `motion` leads from the
+        last scan that counted (`stamp_ns` of this object) to this one; None = not known.
         """
-        started = time.perf_counter()
+        watch = Watch()
+        if T_base_lidar is None:
+            T_base_lidar = mounting_matrix(self.config.scan.mounting)
         prepared = prepare_scan(scan, self.config.scan, self.encoder.preprocessing, gravity_base, T_base_lidar)
-        prepared_at = time.perf_counter()
+        watch.lap("prepare_ms")
         if prepared.patch is None:
-            timings = Timings(prepare_ms=1e3 * (prepared_at - started))
-            return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts, timings)
+            return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts, watch.timings)
         descriptors = encode_query(self.encoder, prepared.patch.points)
-        encoded_at = time.perf_counter()
-        candidates = retrieve(descriptors, self.aerial_map, self.config.top_k, self.calibration)
-        frame = self.aerial_map.frame
-        belief = judge(candidates, frame.to_enu(candidates.grid), self.config.credibility)
-        grid = frame.from_enu(belief.enu[None])
-        latitude, longitude, altitude = frame.to_geographic(grid)
-        searched_at = time.perf_counter()
-        return Estimate(
-            stamp_ns=scan.stamp_ns,
-            status=belief.status,
-            reason=belief.reason,
-            grid=grid[0],
-            enu=belief.enu,
-            latitude_deg=float(latitude[0]),
-            longitude_deg=float(longitude[0]),
-            altitude_m=float(altitude[0]),
-            covariance=belief.covariance,
-            candidates=candidates,
-            counts=prepared.counts,
-            timings=Timings(
-                prepare_ms=1e3 * (prepared_at - started),
-                encode_ms=1e3 * (encoded_at - prepared_at),
-                search_ms=1e3 * (searched_at - encoded_at),
-            ),
+        watch.lap("encode_ms")
+        found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
+        candidates = _first(found, self.config.top_k)
+        place = judge(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.credibility)
+        watch.lap("search_ms")
+        if self._aligner is None:
+            return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
+        hypotheses = self._tracker.predict(scan.stamp_ns, motion)
+        aligned = self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses)
+        watch.lap("align_ms")
+        belief = self._tracker.update(aligned)
+        self._looks.state = belief.state
+        watch.lap("fuse_ms")
+        return posed_estimate(
+            scan.stamp_ns,
+            self.aerial_map.frame,
+            place,
+            candidates,
+            aligned,
+            belief,
+            gravity_base,
+            prepared.counts,
+            watch,
         )
+
+    def set_prior(self, prior: PosePrior) -> None:
+        """Take in what is known of the pose from outside: an operator's initial pose, a compass."""
+        self._tracker.set_prior(prior)
+
+    def reset(self) -> None:
+        """Forget every hypothesis: the robot may be anywhere."""
+        self._tracker.reset()
+        self._looks.reset()
 
     def warm_up(self) -> None:
         """Run every step once, so that the first scan is as fast as the others.
@@ -80,6 +109,8 @@ class Localizer:
         Call it in the thread that localizes: numerical libraries keep state for each thread.
         """
         self.encoder.warm_up()
+        if self._aligner is not None:
+            self._aligner.warm_up()
         rng = np.random.default_rng(0)
         ground = np.column_stack([rng.uniform(-30, 30, (8000, 2)), np.full(8000, -self.config.scan.mounting.z_m)])
         walls = np.column_stack([rng.uniform(-30, 30, 8000), np.full(8000, 12.0), rng.uniform(0, 8, 8000)])
@@ -87,28 +118,62 @@ class Localizer:
         up = np.array([0.0, 0.0, 1.0])
         for gravity_base in (None, up):
             self.localize(Scan(points, stamp_ns=0, frame_id="warm_up"), gravity_base)
+        self.reset()
+
+    @property
+    def _candidates_sought(self) -> int:
+        aligned = 0 if self._aligner is None else self.config.alignment.candidates
+        return max(self.config.top_k, aligned)
+
+    def _align(
+        self,
+        aligner: Aligner,
+        stamp_ns: int,
+        prepared: PreparedScan,
+        T_base_lidar: Float64Array,
+        found: Candidates,
+        hypotheses: Hypotheses,
+    ) -> AlignedPoses:
+        """Align around the hypotheses, and as often as is due around the candidates or everywhere."""
+        around = found.grid[: self.config.alignment.candidates] if self._looks.around(stamp_ns) else np.empty((0, 3))
+        everywhere = aligner.searches_everywhere and self._looks.everywhere(stamp_ns)
+        sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
+        if aligner.searches_everywhere and self.config.alignment.search == "exhaustive":
+            around = np.empty((0, 3))
+        return aligner.align(prepared, sensor_xy, around, hypotheses, exhaustive=everywhere)
 
 
-def no_estimate(
-    stamp_ns: int, reason: str, counts: ScanCounts | None = None, timings: Timings | None = None
-) -> Estimate:
-    """Return the estimate of a scan that led to no candidate at all, with the reason."""
-    return Estimate(
-        stamp_ns=stamp_ns,
-        status=FixStatus.NO_FIX,
-        reason=reason,
-        grid=np.full(3, np.nan),
-        enu=np.full(3, np.nan),
-        latitude_deg=float("nan"),
-        longitude_deg=float("nan"),
-        altitude_m=float("nan"),
-        covariance=np.full((3, 3), np.nan),
-        candidates=Candidates(
-            submap_ids=np.empty(0, dtype=np.int64),
-            descriptor_distances=np.empty(0, dtype=np.float32),
-            probabilities=np.empty(0),
-            grid=np.empty((0, 3)),
-        ),
-        counts=counts or ScanCounts(),
-        timings=timings or Timings(),
+class Looks:
+    """When to look beyond the hypotheses: at every scan while the place is not known, now and then when it is."""
+
+    def __init__(self, around_every_s: float, everywhere_every_s: float) -> None:
+        self._every_ns = (round(around_every_s * 1e9), round(everywhere_every_s * 1e9))
+        self.reset()
+
+    def reset(self) -> None:
+        """Look at the next scan."""
+        self.state = TrackState.SEARCHING
+        self._last_ns: list[int | None] = [None, None]
+
+    def around(self, stamp_ns: int) -> bool:
+        """Return whether the candidates' surroundings are due; then they are taken as looked at."""
+        return self._due(0, stamp_ns, self.state is not TrackState.LOCALIZED)
+
+    def everywhere(self, stamp_ns: int) -> bool:
+        """Return whether the whole map is due; then it is taken as looked at."""
+        return self._due(1, stamp_ns, False)
+
+    def _due(self, which: int, stamp_ns: int, always: bool) -> bool:
+        last = self._last_ns[which]
+        due = always or last is None or not 0 <= stamp_ns - last < self._every_ns[which]
+        if due:
+            self._last_ns[which] = stamp_ns
+        return due
+
+
+def _first(candidates: Candidates, count: int) -> Candidates:
+    """Return the first `count` candidates; their shares of belief were taken among all."""
+    return dataclasses.replace(
+        candidates,
+        **{item.name: getattr(candidates, item.name)[:count] for item in dataclasses.fields(candidates)},
     )

@@ -11,6 +11,7 @@ import pytest
 
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import (
+    AlignmentConfig,
     BuildConfig,
     CalibrationConfig,
     CredibilityConfig,
@@ -26,6 +27,7 @@ from crossloc3d_ros.types import Estimate, FixStatus, Scan
 Float32 = npt.NDArray[np.float32]
 ORIGIN = np.array([628_500.0, 5_804_000.0, 2.0])
 PLACES = 30
+BY_PLACE = AlignmentConfig(search="off")  # the map of these tests has no rasters
 STAMP_NS = 1_700_000_000_123_456_789
 
 
@@ -73,7 +75,7 @@ def grid_of_place(i: int) -> npt.NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def aerial_map() -> AerialMap:
-    encoder, config = HistogramEncoder(), LocalizerConfig()
+    encoder, config = HistogramEncoder(), LocalizerConfig(alignment=BY_PLACE)
     descriptors = []
     for i in range(PLACES):
         patch = prepare_scan(scan_of_place(i), config.scan, encoder.preprocessing).patch
@@ -93,7 +95,7 @@ def aerial_map() -> AerialMap:
 
 @pytest.fixture(scope="module")
 def localizer(aerial_map: AerialMap) -> Localizer:
-    return Localizer(aerial_map, HistogramEncoder(), LocalizerConfig())
+    return Localizer(aerial_map, HistogramEncoder(), LocalizerConfig(alignment=BY_PLACE))
 
 
 @pytest.mark.parametrize("place", [0, 7, 29])
@@ -155,7 +157,7 @@ def test_a_scan_from_nowhere_gives_no_fix(localizer: Localizer) -> None:
 
 def test_settings_override_the_calibration_of_the_weights(aerial_map: AerialMap) -> None:
     def localize(credibility: CredibilityConfig) -> Estimate:
-        config = LocalizerConfig(top_k=5, credibility=credibility)
+        config = LocalizerConfig(top_k=5, credibility=credibility, alignment=BY_PLACE)
         return Localizer(aerial_map, HistogramEncoder(), config).localize(scan_of_place(4))
 
     assert localize(CredibilityConfig()).status is FixStatus.FIX
@@ -166,6 +168,6 @@ def test_settings_override_the_calibration_of_the_weights(aerial_map: AerialMap)
 
 
 def test_warm_up_leaves_nothing_behind(aerial_map: AerialMap) -> None:
-    cold, warm = (Localizer(aerial_map, HistogramEncoder(), LocalizerConfig()) for _ in range(2))
+    cold, warm = (Localizer(aerial_map, HistogramEncoder(), LocalizerConfig(alignment=BY_PLACE)) for _ in range(2))
     warm.warm_up()
     np.testing.assert_array_equal(cold.localize(scan_of_place(2)).grid, warm.localize(scan_of_place(2)).grid)

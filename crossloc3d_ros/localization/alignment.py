@@ -1,0 +1,197 @@
+"""From places to poses: where exactly, and in which heading, a scan fits the aerial map.
+
+The surroundings of all candidates, or the whole map, are searched exhaustively in coarse cells; what fits best is
+climbed to its top in fine ones. The score's height above what a scan from elsewhere would get becomes a likelihood, its
+shape a covariance.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+
+import numpy as np
+from scipy.special import logsumexp
+
+from crossloc3d_ros.clouds.scan import PreparedScan
+from crossloc3d_ros.config import AlignmentConfig
+from crossloc3d_ros.localization.evidence import Evidence, evidence_of
+from crossloc3d_ros.localization.likelihood import MapLikelihood
+from crossloc3d_ros.localization.observation_model import ObservationModel
+from crossloc3d_ros.localization.search import (
+    Peaks,
+    around,
+    climb,
+    inside,
+    local_search,
+    merge,
+    scores_at,
+    search_cells,
+    wrapped,
+)
+from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.types import EXHAUSTIVE, AlignedPoses, Float64Array, Hypotheses, Int64Array, no_aligned_poses
+
+_COARSE_RETURNS, _COARSE_PASSAGES = 250, 300
+_MIDDLE_RETURNS, _MIDDLE_PASSAGES = 500, 500
+_FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
+_COARSE_HEADINGS = 48
+_APART_M = 8.0
+_SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
+_SHAPE_STEPS_M = np.array([-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5])
+_SHAPE_STEPS_RAD = np.radians([-2.0, -1.0, 0.0, 1.0, 2.0])
+_LEAST_STD_M, _LEAST_STD_RAD = 0.1, math.radians(0.2)
+
+
+class Aligner:
+    """Align scans with one aerial map."""
+
+    def __init__(self, aerial_map: AerialMap, config: AlignmentConfig, model: ObservationModel | None = None) -> None:
+        """Bring map and observation model (the shipped one by default) together."""
+        self.aerial_map, self.config = aerial_map, config
+        self.model = model or ObservationModel.load()
+        self.likelihood = MapLikelihood(aerial_map, self.model)
+        self._threads = min(os.cpu_count() or 1, 4)
+        west, south, east, north = aerial_map.bounds
+        self.area_m2 = (east - west) * (north - south)
+        self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
+
+    @property
+    def searches_everywhere(self) -> bool:
+        """Whether the whole map is searched: told to, or left the choice and the map is small."""
+        small = self.area_m2 <= 1e6 * self.config.exhaustive_km2
+        return self.config.search == "exhaustive" or (self.config.search == "auto" and small)
+
+    def warm_up(self) -> None:
+        """Read what an exhaustive search needs, so that the first scan does not wait for it."""
+        if self.searches_everywhere:
+            self.likelihood.prepare()
+
+    def align(
+        self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Float64Array,
+        hypotheses: Hypotheses | None = None, *, exhaustive: bool = False,
+    ) -> AlignedPoses:  # fmt: skip
+        """Return where the scan fits, best first.
+
+        `sensor_xy_m`: where the sensor is on the base. `candidates` (k, 3): grid positions around which to look, best
+        first; with `exhaustive` the whole map is searched beside them. Every hypothesis has one pose of its own in the
+        result, as far as it lies on the map.
+        """
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
+        if len(evidence) < self.config.min_cells:
+            return no_aligned_poses()
+        fine = evidence.some(_FINE_RETURNS, _FINE_PASSAGES)
+        found = self._found(evidence, candidates, exhaustive)
+        followed = self._followed(hypotheses)
+        poses = np.vstack([found.poses, followed])
+        if not len(poses):
+            return no_aligned_poses()
+        reach = np.concatenate([np.full(len(found.poses), 6.0), np.full(len(followed), self.config.follow_m)])
+        peaks, rested = climb(fine, self.likelihood, poses, reach_m=float(reach.max()))
+        source = self._sources(peaks, len(found.poses), candidates, exhaustive)
+        kept = self._kept(peaks, len(found.poses))
+        counts = fine.counts()
+        log_likelihood = self.model.log_likelihood(peaks.scores, counts)
+        kept = kept[np.argsort(-peaks.scores[kept], kind="stable")]
+        chosen = peaks.poses[kept]
+        covariance = np.array([self._covariance(fine, pose) for pose in chosen]).reshape(-1, 3, 3)
+        log_odds = log_likelihood[kept] + self.log_prior
+        # A hypothesis and a peak of the search may be one pose: it counts once.
+        counted = log_odds.copy()
+        counted[_repeated(chosen)] = -np.inf
+        probabilities = np.exp(counted - np.logaddexp(0.0, logsumexp(counted)))
+        return AlignedPoses(
+            grid=self._grid(chosen),
+            heading_rad=np.array([wrapped(float(a)) for a in chosen[:, 2]]),
+            covariance=covariance,
+            log_likelihood=log_likelihood[kept],
+            probabilities=probabilities,
+            inliers=np.clip(peaks.scores[kept] / max(float(self.model.expected @ counts), 1e-9), 0.0, 1.0),
+            converged=rested[kept],
+            source=source[kept],
+            log_prior=self.log_prior,
+        )
+
+    def _found(self, evidence: Evidence, candidates: Float64Array, exhaustive: bool) -> Peaks:
+        """Return the peaks of the coarse search, brought to the middle level."""
+        coarse, middle = self.likelihood.levels
+        places = [(float(e), float(n)) for e, n in self._local(candidates[:, :2])] if len(candidates) else []
+        if exhaustive:
+            self.likelihood.prepare()
+            cells = inside(self.likelihood, coarse)
+        else:
+            for easting, northing in candidates[:, :2]:
+                r = self.config.radius_m
+                self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
+            cells = around(self.likelihood, coarse, places, self.config.radius_m)
+        peaks = search_cells(
+            evidence.coarser(coarse.cell_m, _COARSE_RETURNS, _COARSE_PASSAGES), coarse, cells, _COARSE_HEADINGS,
+            self.config.peaks, _APART_M, self._threads if exhaustive else 1,
+        )  # fmt: skip
+        if not len(peaks.scores):
+            return peaks
+        nearer = local_search(
+            evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES), middle, peaks.poses, 4.0,
+            math.radians(7.5), 2,
+        )  # fmt: skip
+        best = merge(nearer, 4.0, _SAME_RAD)[: self.config.poses]
+        return Peaks(nearer.poses[best], nearer.scores[best])
+
+    def _followed(self, hypotheses: Hypotheses | None) -> Float64Array:
+        """Return the hypotheses (h, 3) as poses to begin at; those off the map as NaN are left to the climb."""
+        if hypotheses is None or not len(hypotheses):
+            return np.empty((0, 3))
+        local = self._local(hypotheses.grid[:, :2])
+        r = self.config.radius_m
+        for easting, northing in hypotheses.grid[:, :2]:
+            self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
+        return np.column_stack([local, hypotheses.heading_rad])
+
+    def _sources(self, peaks: Peaks, found: int, candidates: Float64Array, exhaustive: bool) -> Int64Array:
+        """Return where each search began: the nearest candidate, the hypothesis, or everywhere."""
+        source = np.full(len(peaks.scores), EXHAUSTIVE, np.int64)
+        if len(candidates) and not exhaustive:
+            local = self._local(candidates[:, :2])
+            away = np.hypot(*(peaks.poses[:found, None, :2] - local[None]).transpose(2, 0, 1))
+            source[:found] = away.argmin(axis=1)
+        source[found:] = -1 - np.arange(len(source) - found)
+        return source
+
+    def _kept(self, peaks: Peaks, found: int) -> Int64Array:
+        """Return the rows of all hypotheses and of the peaks that are poses of their own."""
+        first = Peaks(peaks.poses[:found], peaks.scores[:found])
+        return np.concatenate([merge(first, _SAME_M, _SAME_RAD), np.arange(found, len(peaks.scores))])
+
+    def _covariance(self, evidence: Evidence, pose: Float64Array) -> Float64Array:
+        """Return the covariance (3, 3) of a pose from the shape of the score around it."""
+        steps = np.stack(np.meshgrid(_SHAPE_STEPS_M, _SHAPE_STEPS_M, _SHAPE_STEPS_RAD, indexing="ij"), -1).reshape(
+            -1, 3
+        )
+        scores = scores_at(evidence.some(500, 500), self.likelihood, pose + steps)
+        scores *= len(evidence) / max(len(evidence.some(500, 500)), 1)
+        weights = np.exp((scores - scores.max()) / self.config.shape_temperature)
+        weights /= weights.sum()
+        offsets = steps - weights @ steps
+        spread = (offsets * weights[:, None]).T @ offsets
+        return np.asarray(spread + np.diag([_LEAST_STD_M**2, _LEAST_STD_M**2, _LEAST_STD_RAD**2]))
+
+    def _local(self, grid: Float64Array) -> Float64Array:
+        return np.asarray(grid - np.array([self.likelihood.west_m, self.likelihood.south_m]))
+
+    def _grid(self, poses: Float64Array) -> Float64Array:
+        """Return (n, 3) grid positions of poses, on the terrain."""
+        easting, northing = poses[:, 0] + self.likelihood.west_m, poses[:, 1] + self.likelihood.south_m
+        heights = [self.likelihood.terrain_height(float(e), float(n)) for e, n in zip(easting, northing, strict=True)]
+        return np.column_stack([easting, northing, heights])
+
+
+def _repeated(poses: Float64Array) -> np.ndarray:
+    """Mark the poses (n, 3), best first, that are the same as a better one."""
+    repeated = np.zeros(len(poses), np.bool_)
+    for i in range(len(poses)):
+        for j in range(i):
+            near = math.hypot(*(poses[i, :2] - poses[j, :2])) < _SAME_M
+            if near and abs(wrapped(float(poses[i, 2] - poses[j, 2]))) < _SAME_RAD:
+                repeated[i] = True
+                break
+    return repeated

@@ -1,0 +1,154 @@
+"""From what was found to what is told: estimates in every frame that a robot may ask for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+import numpy as np
+
+from crossloc3d_ros.clouds.filters import levelling_matrix
+from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.localization import credibility, tracking
+from crossloc3d_ros.types import (
+    AlignedPoses,
+    Candidates,
+    Estimate,
+    FixStatus,
+    Float64Array,
+    ScanCounts,
+    Timings,
+    TrackState,
+)
+
+HEIGHT_STD_M, TILT_STD_RAD = 0.5, math.radians(2.0)
+"""Of the terrain under the base, and of its roll and pitch."""
+
+
+class Watch:
+    """Milliseconds from lap to lap."""
+
+    def __init__(self) -> None:
+        self.timings = Timings()
+        self._since = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Note the time since the last lap as that of the step `name`, a field of `Timings`."""
+        now = time.perf_counter()
+        self.timings = dataclasses.replace(self.timings, **{name: 1e3 * (now - self._since)})
+        self._since = now
+
+
+def no_estimate(
+    stamp_ns: int, reason: str, counts: ScanCounts | None = None, timings: Timings | None = None
+) -> Estimate:
+    """Return the estimate of a scan that led to no candidate at all, with the reason."""
+    return Estimate(
+        stamp_ns=stamp_ns,
+        status=FixStatus.NO_FIX,
+        reason=reason,
+        grid=np.full(3, np.nan),
+        enu=np.full(3, np.nan),
+        latitude_deg=float("nan"),
+        longitude_deg=float("nan"),
+        altitude_m=float("nan"),
+        covariance=np.full((3, 3), np.nan),
+        candidates=Candidates(
+            submap_ids=np.empty(0, dtype=np.int64),
+            descriptor_distances=np.empty(0, dtype=np.float32),
+            probabilities=np.empty(0),
+            grid=np.empty((0, 3)),
+        ),
+        counts=counts or ScanCounts(),
+        timings=timings or Timings(),
+    )
+
+
+def placed_estimate(
+    stamp_ns: int, frame: MapFrame, place: credibility.Belief, candidates: Candidates, counts: ScanCounts, watch: Watch
+) -> Estimate:
+    """Return the estimate that retrieval alone gives: a place of some tens of metres, no heading."""
+    grid = frame.from_enu(place.enu[None])
+    latitude, longitude, altitude = frame.to_geographic(grid)
+    return Estimate(
+        stamp_ns=stamp_ns,
+        status=place.status,
+        reason=place.reason,
+        grid=grid[0],
+        enu=place.enu,
+        latitude_deg=float(latitude[0]),
+        longitude_deg=float(longitude[0]),
+        altitude_m=float(altitude[0]),
+        covariance=place.covariance,
+        candidates=candidates,
+        counts=counts,
+        timings=watch.timings,
+        state=TrackState.LOCALIZED if place.status is FixStatus.FIX else TrackState.SEARCHING,
+    )
+
+
+def posed_estimate(
+    stamp_ns: int,
+    frame: MapFrame,
+    place: credibility.Belief,
+    candidates: Candidates,
+    aligned: AlignedPoses,
+    belief: tracking.Belief,
+    gravity_base: Float64Array | None,
+    counts: ScanCounts,
+    watch: Watch,
+) -> Estimate:
+    """Return the estimate of a tracked pose; where no pose is believed at all, the place, without a fix."""
+    if not np.isfinite(belief.grid[:2]).all():
+        placed = placed_estimate(stamp_ns, frame, place, candidates, counts, watch)
+        return dataclasses.replace(
+            placed, status=FixStatus.NO_FIX, reason=belief.reason, state=belief.state, probability=belief.probability,
+            aligned=aligned, hypotheses=belief.hypotheses,
+        )  # fmt: skip
+    height = belief.grid[2] if math.isfinite(belief.grid[2]) else float(place.enu[2])
+    grid = np.array([belief.grid[0], belief.grid[1], height])
+    enu = frame.to_enu(grid[None])[0]
+    latitude, longitude, altitude = frame.to_geographic(grid[None])
+    turn = -float(frame.convergence_rad(grid[None])[0])
+    T_map_base = np.eye(4)
+    T_map_base[:3, :3] = _about_z(belief.heading_rad + turn)
+    if gravity_base is not None:
+        T_map_base[:3, :3] = T_map_base[:3, :3] @ levelling_matrix(gravity_base)[:3, :3]
+    T_map_base[:3, 3] = enu
+    pose_covariance = _in_map(belief.covariance, turn)
+    return Estimate(
+        stamp_ns=stamp_ns,
+        status=FixStatus.FIX if belief.is_fix else FixStatus.NO_FIX,
+        reason=belief.reason,
+        grid=grid,
+        enu=enu,
+        latitude_deg=float(latitude[0]),
+        longitude_deg=float(longitude[0]),
+        altitude_m=float(altitude[0]),
+        covariance=pose_covariance[:3, :3],
+        candidates=candidates,
+        counts=counts,
+        timings=watch.timings,
+        state=belief.state,
+        probability=belief.probability,
+        T_map_base=T_map_base,
+        pose_covariance=pose_covariance,
+        aligned=aligned,
+        hypotheses=belief.hypotheses,
+    )
+
+
+def _about_z(angle: float) -> Float64Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _in_map(covariance: Float64Array, turn_rad: float) -> Float64Array:
+    """Return the covariance (6, 6) of x, y, z and the rotations about them from that of easting, northing, heading."""
+    rotation = _about_z(turn_rad)
+    turned = rotation @ covariance @ rotation.T
+    full = np.diag([0.0, 0.0, HEIGHT_STD_M**2, TILT_STD_RAD**2, TILT_STD_RAD**2, 0.0])
+    rows = [0, 1, 5]
+    full[np.ix_(rows, rows)] = turned
+    return full

@@ -1,0 +1,110 @@
+"""How likely a beam is to be returned from a cell, given what an airborne survey shows there.
+
+The air sees roofs and crowns, the ground walls, trunks and hedges; what they share is learned, not guessed. Each cell
+of the aerial map has a class: how high its surface lies above the terrain, how low and how high the surface around it
+gets, and whether it is rough. For each class and each layer of height, places of known pose tell how often a beam that
+came there was returned. With p that share and q the share over all cells, a return speaks for a place by log(p / q), a
+passage by log((1 - p) / (1 - q)): the log likelihood ratio between "the scan was taken here" and "somewhere".
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from scipy import ndimage
+
+from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS
+from crossloc3d_ros.types import Float32Array, Float64Array, Int32Array
+
+SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "alignment.safetensors"
+HEIGHTS_M = np.array([0.4, 1.2, 2.5, 5.0, 10.0])
+"""Heights above the terrain between which the classes change."""
+_STEPS = len(HEIGHTS_M) + 1
+_ROUGH_M = 2.0  # mean bend of the surface from which it is a crown rather than a roof
+UNKNOWN = 2 * _STEPS**3
+"""Class of a cell of which the survey says nothing."""
+CLASSES = UNKNOWN + 1
+MARGIN_CELLS = 3
+"""So far beyond its edges a raster must be known for the classes inside to be right."""
+_PRIOR = 50.0  # observations that a class starts with
+_STEEPEST = 4.0  # no single cell says more
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationModel:
+    """The log likelihood ratios, and what sums of them mean."""
+
+    log_ratios: Float32Array
+    """(CHANNELS, CLASSES)"""
+    expected: Float64Array
+    """(CHANNELS,) mean log ratio of a cell of each channel at the true pose."""
+    expected_share: float = 0.5
+    """At this share of the score expected at the true pose, 'here' is as likely as 'off the map'."""
+    temperature: float = 10.0
+    """Score that multiplies the odds by e; scores are sums over cells that are not independent."""
+
+    def log_likelihood(self, scores: Float64Array, counts: np.ndarray) -> Float64Array:
+        """Return log likelihood ratios (n,) of scores (n,) of a scan with `counts` (CHANNELS,) cells a channel."""
+        expected = float(self.expected @ counts)
+        return np.asarray((scores - self.expected_share * expected) / self.temperature)
+
+    def save(self, path: Path) -> None:
+        """Write the model to a file."""
+        tensors: dict[str, np.ndarray] = {"log_ratios": self.log_ratios, "expected": self.expected}
+        settings = {"expected_share": self.expected_share, "temperature": self.temperature}
+        save_file(tensors, path, metadata={"calibration": json.dumps(settings)})
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> ObservationModel:
+        """Read a model, the shipped one by default; CrossLocError where the file is none."""
+        return _load(path or SHIPPED)
+
+
+@functools.cache
+def _load(path: Path) -> ObservationModel:
+    try:
+        with safe_open(path, framework="numpy") as file:
+            ratios, expected = file.get_tensor("log_ratios"), file.get_tensor("expected")
+            settings = json.loads(file.metadata()["calibration"])
+        if ratios.shape != (CHANNELS, CLASSES) or expected.shape != (CHANNELS,):
+            raise ValueError(f"log ratios of shape {ratios.shape}")
+        return ObservationModel(ratios, expected, float(settings["expected_share"]), float(settings["temperature"]))
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CrossLocError(f"{path} is not an observation model of this version: {error}") from error
+
+
+def surface_classes(terrain: Float32Array, surface: Float32Array) -> Int32Array:
+    """Return the class (H, W) of each cell of 1 m from terrain and surface (H, W) in metres, NaN where unknown."""
+    above = surface - terrain
+    known = np.isfinite(above)
+    held = np.where(known, above, 0.0)
+    highest = ndimage.maximum_filter(np.where(known, above, -np.inf), 3)
+    lowest = ndimage.minimum_filter(np.where(known, above, np.inf), 3)
+    rough = ndimage.uniform_filter(np.abs(ndimage.laplace(held)), 3) > _ROUGH_M
+    steps = [np.digitize(values, HEIGHTS_M) for values in (held, lowest, highest)]
+    classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * 2 + rough
+    return np.where(known, classes, UNKNOWN).astype(np.int32)
+
+
+def fit_log_ratios(seen: Float64Array) -> tuple[Float32Array, Float64Array]:
+    """Return log ratios (CHANNELS, CLASSES) and their expectation (CHANNELS,) at true poses.
+
+    `seen` (CHANNELS, CLASSES) counts the cells of each channel that fell on each class at true poses.
+    """
+    returns, passages = seen[:LAYERS], seen[LAYERS:]
+    share = returns.sum(axis=1, keepdims=True) / np.maximum(seen[:LAYERS] + seen[LAYERS:], 1e-9).sum(
+        axis=1, keepdims=True
+    )
+    p = (returns + _PRIOR * share) / (returns + passages + _PRIOR)
+    ratios = np.concatenate([np.log(p / share), np.log((1.0 - p) / (1.0 - share))])
+    ratios[:, UNKNOWN] = 0.0
+    ratios = np.clip(ratios, -_STEEPEST, _STEEPEST)
+    expected = (seen * ratios).sum(axis=1) / np.maximum(seen.sum(axis=1), 1.0)
+    return ratios.astype(np.float32), expected
