@@ -106,11 +106,11 @@ class _Mixture:
         return len(self.height)
 
     def take(self, rows: Int64Array | BoolArray) -> _Mixture:
-        return _Mixture(*(getattr(self, item.name)[rows] for item in dataclasses.fields(self)))
+        return _Mixture(*(values[rows] for values in vars(self).values()))
 
     def join(self, other: _Mixture) -> _Mixture:
-        names = [item.name for item in dataclasses.fields(self)]
-        return _Mixture(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Mixture(*(np.concatenate(pair) for pair in pairs))
 
 
 class Tracker:
@@ -416,6 +416,8 @@ class Tracker:
             else:
                 state = TrackState.LOST if self._was_localized else TrackState.SEARCHING
             reason = self._why_not(mixture, weights, near, probability, belief, none, enough, float(followed))
+            if self._unknown_reason:
+                reason += f", since the motion was unknown: {self._unknown_reason}"
         return Belief(state, reason, probability, grid, heading, covariance, self._hypotheses(), is_fix)
 
     def _why_not(
@@ -431,10 +433,9 @@ class Tracker:
     ) -> str:
         config = self._config
         if enough:
-            since = f" since the motion was unknown ({self._unknown_reason})" if self._unknown_reason else ""
             return (
-                f"one place is believed {_percent(probability)}, but has explained {followed_m:.1f} m of"
-                f" {config.confirm_m:g} m{since}"
+                f"one place is believed {_percent(probability)}, but has explained only {followed_m:.1f} m of the"
+                f" {config.confirm_m:g} m needed"
             )
         if none >= 0.5:
             what = (
@@ -447,8 +448,8 @@ class Tracker:
             leader = int(np.argmax(weights))
             apart = float(np.hypot(*(mixture.mean[leader] - mixture.mean[rival])[:2]))
             return (
-                f"{1 + len(rivals)} places are believed, {_percent(belief)} the likeliest and {_percent(weights[rival])}"
-                f" one {apart:.0f} m away"
+                f"{1 + len(rivals)} places are believed, {_percent(belief)} the likeliest"
+                f" and {_percent(weights[rival])} one {apart:.0f} m away"
             )
         if probability < 0.9 * belief:
             std = float(np.sqrt(np.linalg.eigvalsh(mixture.covariance[np.argmax(weights), :2, :2])[1]))
@@ -675,20 +676,18 @@ def _merge(mixture: _Mixture, most: int) -> _Mixture:
             group[near[i] & (group < 0)] = i
     leaders = np.unique(group)[:most]
     merged = mixture.take(leaders)
-    mean, joint, log_weight = merged.mean.copy(), merged.covariance.copy(), merged.log_weight.copy()
-    for row, leader in enumerate(leaders):
-        members = np.flatnonzero(group == leader)
-        if len(members) == 1:
-            continue
-        log_weight[row] = _log_sum(mixture.log_weight[members])
-        shares = np.exp(mixture.log_weight[members] - log_weight[row])
-        off = mixture.mean[members] - mixture.mean[leader]
-        off[:, 2] = _wrap(off[:, 2])
-        middle = shares @ off
-        mean[row] = mixture.mean[leader] + middle
-        rest = off - middle
-        joint[row] = np.einsum("b,bij->ij", shares, mixture.covariance[members]) + (rest * shares[:, None]).T @ rest
-    return dataclasses.replace(merged, mean=mean, covariance=joint, log_weight=log_weight)
+    member = leaders[:, None] == group[None]
+    log_weight = _log_sum(np.where(member, mixture.log_weight, -np.inf), axis=1)
+    shares = np.where(member, np.exp(mixture.log_weight - log_weight[:, None]), 0.0)
+    off = mixture.mean[None] - merged.mean[:, None]
+    off[..., 2] = _wrap(off[..., 2])
+    middle = np.einsum("ln,lni->li", shares, off)
+    rest = (off - middle[:, None]) * np.sqrt(shares)[..., None]
+    joint = np.tensordot(shares, mixture.covariance, axes=1) + rest.transpose(0, 2, 1) @ rest
+    followed_m = np.where(member, mixture.followed_m, 0.0).max(axis=1)
+    return dataclasses.replace(
+        merged, mean=merged.mean + middle, covariance=joint, log_weight=log_weight, followed_m=followed_m
+    )
 
 
 def _estimate(
