@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import dataclasses
 import math
 import threading
 from dataclasses import dataclass
@@ -12,9 +13,11 @@ import numpy as np
 
 from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import ConfigError
-from crossloc3d_ros.types import Float64Array
+from crossloc3d_ros.types import Float32Array, Float64Array
 
 _KEPT_NS = 120_000_000_000
+_SCAN_GAP_S = 1.5  # scans farther apart than this share too little to be aligned with each other while driving
+_LEAST_POINTS = 100
 _STAND_STILL_M = 0.01  # one sigma of a motion's position and, in radians, a tenth of it of its heading: never 0
 
 
@@ -59,6 +62,10 @@ class OdometryBuffer:
         """Stamp of the newest sample; None where there is none."""
         return self._stamps_ns[-1] if self._stamps_ns else None
 
+    def is_late(self, stamp_ns: int) -> bool:
+        """Return whether a sample of this stamp would be left out as late or repeated."""
+        return bool(self._stamps_ns) and 0 <= self._stamps_ns[-1] - stamp_ns <= self._config.restart_s * 1e9
+
     def reset(self) -> None:
         """Forget all samples."""
         with self._lock:
@@ -76,9 +83,9 @@ class OdometryBuffer:
                 self._refused = "the last pose of the odometry is not a pose"
                 return False
             self._refused = ""
+            if self.is_late(stamp_ns):
+                return False
             if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
-                if self._stamps_ns[-1] - stamp_ns <= self._config.restart_s * 1e9:
-                    return False
                 self._clear()
             self._jumps.append(self._impossible(stamp_ns, pose))
             self._stamps_ns.append(stamp_ns)
@@ -170,22 +177,28 @@ class ScanOdometry:
         """Set up KISS-ICP; ConfigError where the library is not installed."""
         self._max_range_m = max_range_m
         self._odometry = _kiss_icp(max_range_m)
-        self._buffer = OdometryBuffer(config)
+        self._gap_s = max(config.odometry_gap_s, _SCAN_GAP_S)
+        self._buffer = OdometryBuffer(dataclasses.replace(config, odometry_gap_s=self._gap_s))
 
     def reset(self) -> None:
         """Forget the scans seen so far."""
         self._odometry = _kiss_icp(self._max_range_m)
         self._buffer.reset()
 
-    def add(self, stamp_ns: int, points: Float64Array) -> bool:
-        """Take in one scan (N, 3), metres, base frame, and return whether it can be used."""
-        newest_ns = self._buffer.newest_ns
-        if newest_ns is not None and stamp_ns <= newest_ns:
-            if not self._buffer.add(stamp_ns, np.eye(4)):
-                return False
-            self.reset()
+    def add(self, stamp_ns: int, points: Float32Array | Float64Array) -> bool:
+        """Take in one scan (N, 3), metres, base frame, and return whether it can be used.
+
+        Late and repeated scans and those of fewer than a hundred points cannot; a stamp that lies back by more than
+        `restart_s` begins anew.
+        """
         finite = np.asarray(points, dtype=np.float64)
         finite = finite[np.isfinite(finite).all(axis=1)]
+        if len(finite) < _LEAST_POINTS or self._buffer.is_late(stamp_ns):
+            return False
+        newest_ns = self._buffer.newest_ns
+        if newest_ns is not None and not 0 < stamp_ns - newest_ns <= self._gap_s * 1e9:
+            # Too far from the last scan to be aligned with it: a new odometry, which the gap keeps from the old one.
+            self._odometry = _kiss_icp(self._max_range_m)
         self._odometry.register_frame(np.ascontiguousarray(finite), np.empty(0))
         return self._buffer.add(stamp_ns, np.asarray(self._odometry.last_pose))
 
