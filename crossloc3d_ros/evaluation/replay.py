@@ -105,12 +105,9 @@ def localize_bag(
             if isinstance(moment.scan, CloudError):
                 estimate = no_estimate(moment.stamp_ns, str(moment.scan))
             else:
-                motion = None if motions is None else motions.since_last(moment.stamp_ns)
+                motion = None if motions is None else motions.between(localizer.stamp_ns, moment.stamp_ns)
                 try:
-                    if motions is None:
-                        estimate = localizer.localize(moment.scan, moment.up)
-                    else:
-                        estimate = localizer.localize(moment.scan, moment.up, motion=motion)
+                    estimate = localizer.localize(moment.scan, moment.up, motion=motion)
                 except CloudError as error:
                     estimate = no_estimate(moment.stamp_ns, str(error))
             writer.write(estimate)
@@ -132,7 +129,7 @@ class _Moment(NamedTuple):
 
 
 class _Motions:
-    """How the robot moved from the last localized scan to the next."""
+    """How the robot moved between scans."""
 
     def __init__(self, source: OdometrySource, localizer: Localizer) -> None:
         self.topic = source.topic
@@ -141,7 +138,6 @@ class _Motions:
         self._max_range_m = localizer.config.scan.max_range_m
         fusion = localizer.config.fusion
         self._buffer = OdometryBuffer(fusion) if source.topic is not None else ScanOdometry(fusion, self._max_range_m)
-        self._last_ns: int | None = None
         self._warned = False
 
     def take_odometry(self, message: Any, recorded_ns: int) -> None:
@@ -171,10 +167,9 @@ class _Motions:
         newest_ns = self._buffer.newest_ns
         return now_ns - moment.recorded_ns > HELD_NS or (newest_ns is not None and newest_ns >= moment.stamp_ns)
 
-    def since_last(self, stamp_ns: int) -> Motion | None:
-        """Return the motion from the scan of the last call to this one; None for the first."""
-        last_ns, self._last_ns = self._last_ns, stamp_ns
-        return None if last_ns is None else self._buffer.motion(last_ns, stamp_ns)
+    def between(self, from_ns: int | None, to_ns: int) -> Motion | None:
+        """Return the motion between the stamps of two scans; None where there is no first one."""
+        return None if from_ns is None else self._buffer.motion(from_ns, to_ns)
 
 
 def _moments(

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from crossloc3d_ros.config import (
+    AlignmentConfig,
     BuildConfig,
     CalibrationConfig,
     CredibilityConfig,
@@ -51,5 +52,6 @@ def town_map(town_drive, tmp_path_factory: pytest.TempPathFactory) -> AerialMap:
 
 @pytest.fixture(scope="session")
 def localizer(town_map: AerialMap) -> Localizer:
-    credibility = CredibilityConfig(min_probability=0.3)
-    return Localizer(town_map, RingHistogram(), LocalizerConfig(credibility=credibility))
+    """Places by retrieval alone: scans in any heading, 8 m and half a second apart, are no drive to be followed."""
+    credibility, alignment = CredibilityConfig(min_probability=0.3), AlignmentConfig(search="off")
+    return Localizer(town_map, RingHistogram(), LocalizerConfig(credibility=credibility, alignment=alignment))

@@ -42,6 +42,10 @@ class Listener:
     stamps_ns: list[int] = field(default_factory=list)
     motions: list[Motion | None] = field(default_factory=list)
 
+    @property
+    def stamp_ns(self) -> int | None:
+        return self.stamps_ns[-1] if self.stamps_ns else None
+
     def localize(
         self,
         scan: Scan,
