@@ -107,6 +107,10 @@ def _parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="NAME=VALUE",
         help="with --protocol pose: another setting of the localizer, such as fusion.min_probability=0.99",
     )  # fmt: skip
+    parser.add_argument(
+        "--odometry", choices=["wheels", "scan", "none"], default="wheels",
+        help="with --protocol pose: what tells along drives how the robot moves (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK or pose_BENCHMARK)")
     parser.add_argument(
         "--data", type=Path, default=Path("out/benchmark"),
@@ -170,6 +174,7 @@ def _evaluate_poses(arguments: argparse.Namespace) -> None:
         "map": f"{about.map_km2:.2f} km², {about.submaps:,} submaps",
         "scans": f"{len(predictions):,} in {len(about.area_names)} areas",
         "weights": f"{about.weights} ({about.encoder[:12]})",
+        "odometry": about.odometry,
         "data": about.data,
     }
     words = _AMSTERDAM_WORDS[:1] if about.pose_set == "amsterdam" else _SIMULATED_WORDS
@@ -202,7 +207,7 @@ def _predict_poses(
     drives = open_drives(pose_set, workers=arguments.workers, surveys=surveys, progress=display)
     journeys = journeys_of(pose_set, drives)
     predictions = predict_poses(pose_set, drives, journeys, loader, config, workers=arguments.workers, progress=display)
-    about = about_of(pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config)
+    about = about_of(pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config, arguments.odometry)
     save_pose_predictions(path, predictions, about)
 
 

@@ -220,7 +220,7 @@ def _words(scores: PoseScores, words: Sequence[str]) -> str:
         "<h3>Two sigma</h3><p>The ellipse of the stated covariance that holds 95.4 % of an honest estimate's errors. "
         "The dashed lines are what honest covariances would show.</p>",
         "<h3>Stages</h3><p>“Retrieval alone” is the first candidate's centre, which has no heading. “+ alignment” is "
-        "the pose found around the foremost candidate that has one, “+ re-ranking” the pose that fits best around any. "
+        "the best pose within 50 m of the foremost candidate that has one, “+ re-ranking” the best of all. "
         "Along drives the same scans, each fifth, are asked alone and with all that came before.</p>",
         "<h3>Intervals</h3><p>Scans of one town are alike, so towns, not scans, are drawn by lot with replacement; "
         "where fewer than eight were asked, squares of 50 m stand in for them. The interval holds 95 % of these draws, "

@@ -10,18 +10,18 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from crossloc3d_ros.config import LocalizerConfig, to_dict
 from crossloc3d_ros.errors import CloudError, EvaluationError
-from crossloc3d_ros.evaluation.pose_drives import Journey, RawDrive, load_drives, steps_of
+from crossloc3d_ros.evaluation.pose_drives import Journey, JourneyStep, RawDrive, load_drives, steps_of
 from crossloc3d_ros.evaluation.pose_sets import PoseSet, Progress, load_pose_set
 from crossloc3d_ros.evaluation.raw_scans import RawScan
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
-from crossloc3d_ros.localization.odometry import Motion, OdometryBuffer
+from crossloc3d_ros.localization.odometry import Motion, OdometryBuffer, ScanOdometry
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.places.workers import EncoderLoader, open_workers
 from crossloc3d_ros.types import (
@@ -36,6 +36,8 @@ from crossloc3d_ros.types import (
 )
 
 FORMAT = 1
+Odometry = Literal["wheels", "scan", "none"]
+"""What tells how the robot moves: its wheels, its scans, nothing."""
 CANDIDATES, ALIGNED = 25, 25
 """How many of each scan's candidates and aligned poses are kept."""
 STATES = tuple(TrackState)
@@ -49,6 +51,10 @@ _SINGLES_AT_ONCE = 16
 
 class PoseLocalizer(Protocol):
     """What is examined: `localization.localizer.Localizer`."""
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Stamp of the scan at which the next motion begins; None before the first."""
 
     def localize(
         self,
@@ -82,6 +88,7 @@ class PoseAbout:
     submaps: int
     config: dict[str, Any] = field(default_factory=dict)
     """The localizer's settings."""
+    odometry: Odometry = "wheels"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +145,7 @@ def predict(
     loader: EncoderLoader,
     config: LocalizerConfig,
     *,
+    odometry: Odometry = "wheels",
     workers: int = 1,
     progress: Progress | None = None,
 ) -> PosePredictions:
@@ -157,8 +165,8 @@ def predict(
     # The longest first, so that no worker is left alone with one at the end.
     order = sorted(range(len(journeys)), key=lambda i: -steps[i])
     where = (pose_set.folder, pose_set.map_folder)
-    tasks = [_Task(*where, config, (i, journeys[i]), ()) for i in order]
-    tasks += [_Task(*where, config, None, rows) for rows in singles]
+    tasks = [_Task(*where, config, odometry, (i, journeys[i]), ()) for i in order]
+    tasks += [_Task(*where, config, odometry, None, rows) for rows in singles]
     sizes = [steps[i] for i in order] + [len(rows) for rows in singles]
     with open_workers(loader, loader(), workers, None, pose_set.folder) as pool:
         parts = list(pool.run_encoding(_do, zip(tasks, sizes, strict=True), advance))
@@ -172,6 +180,7 @@ class _Task:
     folder: Path
     map_folder: Path
     config: LocalizerConfig
+    odometry: Odometry
     journey: tuple[int, Journey] | None
     singles: tuple[int, ...]
 
@@ -184,7 +193,7 @@ def _do(task: _Task, encoder: DescriptorEncoder, advance: Callable[[int], None] 
         scans = _set_of(task.folder, task.map_folder).scans
         return predict_singles([scans[i] for i in task.singles], localizer, frame, told)
     number, journey = task.journey
-    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.config, told)
+    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.config, task.odometry, told)
 
 
 @functools.lru_cache(maxsize=1)
@@ -239,21 +248,18 @@ def predict_journey(
     localizer: PoseLocalizer,
     frame: MapFrame,
     config: LocalizerConfig,
+    odometry: Odometry = "wheels",
     advance: Callable[[int], None] = lambda _: None,
 ) -> PosePredictions:
     """Ask for each scan of a journey, with the odometry that has arrived until then."""
     localizer.reset()
-    buffer = OdometryBuffer(config.fusion)
+    motions = _Motions(odometry, config)
     rows = []
-    before_ns: int | None = None
     for step in steps_of(journey, drives):
-        for stamp_ns, (x, y, heading) in zip(step.odometry_ns.tolist(), step.odometry.tolist(), strict=True):
-            buffer.add(stamp_ns, _planar_pose(x, y, heading))
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
-        motion = None if before_ns is None else buffer.motion(before_ns, step.stamp_ns)
-        estimate = _ask(localizer, scan, motion)
+        motions.take(step, scan)
+        estimate = _ask(localizer, scan, motions.between(localizer.stamp_ns, step.stamp_ns))
         rows.append(_row(scan, estimate, frame, number, step.leg, step.travelled_m))
-        before_ns = step.stamp_ns
         advance(1)
     # Some of them again, alone: what a scan tells by itself, against what the way until there tells.
     for step in [step for step in steps_of(journey, drives) if step.leg == 0][::_ALONE_EVERY]:
@@ -261,6 +267,29 @@ def predict_journey(
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
         rows.append(_row(scan, _ask(localizer, scan, None), frame, _ALONE - number, 0, step.travelled_m))
     return join(rows)
+
+
+class _Motions:
+    """How the robot moved between scans, as the odometry chosen tells it."""
+
+    def __init__(self, odometry: Odometry, config: LocalizerConfig) -> None:
+        self._wheels = OdometryBuffer(config.fusion) if odometry == "wheels" else None
+        self._scans = ScanOdometry(config.fusion, config.scan.max_range_m) if odometry == "scan" else None
+        self._max_range_m = config.scan.max_range_m
+
+    def take(self, step: JourneyStep, scan: RawScan) -> None:
+        """Take in a scan and the odometry that came before it."""
+        if self._wheels is not None:
+            for stamp_ns, (x, y, heading) in zip(step.odometry_ns.tolist(), step.odometry.tolist(), strict=True):
+                self._wheels.add(stamp_ns, _planar_pose(x, y, heading))
+        if self._scans is not None:
+            points = scan.points[np.linalg.norm(scan.points, axis=1) <= self._max_range_m].astype(np.float64)
+            self._scans.add(scan.stamp_ns, points @ scan.T_base_lidar[:3, :3].T + scan.T_base_lidar[:3, 3])
+
+    def between(self, from_ns: int | None, to_ns: int) -> Motion | None:
+        """Return the motion between two stamps; None where nothing tells it."""
+        source = self._scans if self._wheels is None else self._wheels
+        return None if from_ns is None or source is None else source.motion(from_ns, to_ns)
 
 
 def number_of_alone(predictions: PosePredictions) -> Int64Array:
@@ -361,13 +390,15 @@ def _in_order(predictions: PosePredictions) -> PosePredictions:
     return select(predictions, np.lexsort(keys).astype(np.int64))
 
 
-def about_of(pose_set: PoseSet, aerial_map: AerialMap, weights: str, config: LocalizerConfig) -> PoseAbout:
+def about_of(
+    pose_set: PoseSet, aerial_map: AerialMap, weights: str, config: LocalizerConfig, odometry: Odometry
+) -> PoseAbout:
     """Return what the predictions say of themselves."""
     west, south, east, north = aerial_map.bounds
     return PoseAbout(
         pose_set.name, pose_set.folder.name, weights, aerial_map.manifest.encoder_fingerprint, pose_set.area_names,
         pose_set.families, pose_set.on_map, pose_set.groups, (east - west) * (north - south) / 1e6,
-        len(aerial_map.submaps), to_dict(config),
+        len(aerial_map.submaps), to_dict(config), odometry,
     )  # fmt: skip
 
 

@@ -196,12 +196,16 @@ def retrieved(predictions: PosePredictions) -> Float64Array:
 
 
 def first_aligned(predictions: PosePredictions) -> Float64Array:
-    """Return the pose (N, 3) found around the foremost of the candidates that alignment has kept."""
-    found = np.isfinite(predictions.aligned[:, :, 0])
-    source = np.where(found & (predictions.aligned_source >= 0), predictions.aligned_source, np.iinfo(np.int64).max)
-    first = source.argmin(axis=1)  # the best of several from one candidate comes first
-    rows = np.arange(len(predictions))
-    return np.where((source[rows, first] < np.iinfo(np.int64).max)[:, None], predictions.aligned[rows, first], np.nan)
+    """Return the best pose (N, 3) within 50 m of the foremost candidate that has one so near."""
+    source = predictions.aligned_source
+    own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == EXHAUSTIVE))
+    answer = np.full((len(predictions), 3), np.nan)
+    for place in np.moveaxis(predictions.candidates, 1, 0)[::-1]:  # the foremost last: it has the last word
+        offsets = predictions.aligned[:, :, :2] - place[:, None, :]
+        near = own & (np.hypot(offsets[:, :, 0], offsets[:, :, 1]) <= AMONG_M)
+        has = near.any(axis=1)
+        answer[has] = predictions.aligned[has, near[has].argmax(axis=1)]
+    return answer
 
 
 def best_aligned(predictions: PosePredictions) -> Float64Array:

@@ -70,16 +70,19 @@ class Knowing:
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, object]] = []
+        self.stamp_ns: int | None = None
 
     def localize(self, scan: Scan, gravity_base=None, T_base_lidar=None, motion=None) -> Estimate:
         if not len(scan.points):
             raise CloudError("the cloud is empty")
         self.asked.append(("scan", (scan.stamp_ns, gravity_base, T_base_lidar, motion)))
+        self.stamp_ns = scan.stamp_ns
         x, y, heading = scan.points[0].astype(np.float64)
         return estimate_of(pose_at(x, y, heading), scan.stamp_ns)
 
     def reset(self) -> None:
         self.asked.append(("reset", None))
+        self.stamp_ns = None
 
 
 def scan_at(x: float, y: float, heading: float, stamp_ns: int = 0, area: int = 0) -> RawScan:
@@ -163,6 +166,26 @@ def test_along_a_journey_the_motion_since_the_last_scan_is_told() -> None:
     assert rows.leg[track].tolist() == [0] * 12 + [1] * 6
     assert rows.area[track].tolist() == [0] * 12 + [1] * 6
     np.testing.assert_allclose(rows.pose[track], rows.truth[track], atol=1e-3)
+
+
+def test_without_odometry_no_motion_is_told() -> None:
+    localizer = Knowing()
+    drives = [straight_drive(0), straight_drive(1)]
+    predict_journey(0, Journey((Leg(0), Leg(1))), drives, localizer, FRAME, LocalizerConfig(), "none")
+    assert {values[3] for what, values in localizer.asked if what == "scan"} == {None}
+
+
+def test_a_scan_that_does_not_count_is_no_beginning_of_a_motion() -> None:
+    """The motion to the scan after a bad one leads from the last good one."""
+    localizer = Knowing()
+    drive = straight_drive(0)
+    scans = [drive.scans[i] for i in range(len(drive.scans))]
+    scans[4] = dataclasses.replace(scans[4], points=np.zeros((0, 3), np.float32))
+    drive = dataclasses.replace(drive, scans=RawScans.of(scans))
+    rows = predict_journey(0, Journey((Leg(0),)), [drive], localizer, FRAME, LocalizerConfig())
+    motions = [values[3] for what, values in localizer.asked[1:12] if what == "scan"]
+    assert [round(motion.delta[0]) for motion in motions[1:]] == [1, 1, 1, 2, 1, 1, 1, 1, 1, 1]
+    assert np.isnan(rows.pose[4]).all()
 
 
 def test_scans_asked_again_stand_beside_those_of_the_track(tmp_path: Path) -> None:

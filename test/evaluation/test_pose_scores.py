@@ -192,21 +192,28 @@ def test_each_stage_answers_for_itself() -> None:
     rows.aligned[:, 1] = rows.aligned[:, 0] + np.array([50.0, 0.0, 0.0])
     rows.aligned[:, 2] = wrong
     rows.aligned_source[:, :3] = [3, -1, 0]
+    rows.candidates[:, 2] = rows.candidates[:, 0]
+    rows.candidates[:, 0] = wrong[:, :2] + 3.0
+    rows.candidates[:, 1] = wrong[:, :2] + 300.0
     retrieval, aligned, ranked = score_poses(rows, ABOUT).stages
     assert (retrieval.name, aligned.name, ranked.name) == tuple(STAGES)
     assert retrieval.within == 0.0
-    assert retrieval.median_m == pytest.approx(math.hypot(5, 5))
+    assert retrieval.median_m == pytest.approx(103.0, abs=1.0)
     assert aligned.within == 0.0
     assert aligned.median_m == pytest.approx(100.0, abs=1.0)
     assert ranked.within == 1.0
 
 
-def test_a_pose_found_on_the_whole_map_is_no_candidate_s() -> None:
+def test_without_a_pose_near_a_candidate_the_next_candidate_s_counts() -> None:
     rows = answers(8)
-    rows.aligned_source[:, 0] = EXHAUSTIVE
-    stages = score_poses(rows, ABOUT).stages
-    assert stages[1].within == 0.0
-    assert stages[2].within == 1.0
+    rows.candidates[:, 1] = rows.candidates[:, 0]
+    rows.candidates[:, 0] += 500.0
+    rows.aligned_source[:4, 0] = EXHAUSTIVE
+    assert score_poses(rows, ABOUT).stages[1].within == 1.0
+    rows.aligned_source[4:, 0] = -1  # what a hypothesis has brought is not retrieval's
+    assert score_poses(rows, ABOUT).stages[1].within == 0.5
+    rows.candidates[:, 1] += 500.0
+    assert score_poses(rows, ABOUT).stages[1].within == 0.0
 
 
 def test_stages_along_drives_compare_the_same_scans() -> None:
