@@ -90,7 +90,7 @@ TF_PERIOD_S = 0.1
 SAME_CLOCK_NS = 10_000_000_000
 """An initial pose whose stamp lies farther from the next cloud's is taken for that cloud: another clock stamped it."""
 HEADING_AGE_NS = 500_000_000
-SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.", "fusion.")
+SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.", "alignment.", "fusion.")
 """Parameters that a running node takes up at once; the others need a new configuration of the node."""
 
 
@@ -147,8 +147,6 @@ class LocalizerNode(LifecycleNode):
         self._scan_odometry: ScanOdometry | None = None
         self._orders: deque[Callable[[Localizer, int], None]] = deque()
         """What the worker does before the next scan, given its stamp: nobody else touches the hypotheses."""
-        self._localized_ns: int | None = None
-        """Stamp of the scan that the hypotheses stand at; the worker's own."""
         self._initial_pose = ""
         self._initial_pose_timer: Any = None
         self._worker = NewestWorker(self._process, "localize")
@@ -493,7 +491,6 @@ class LocalizerNode(LifecycleNode):
 
     def _reset_localizer(self, localizer: Localizer, stamp_ns: int) -> None:
         localizer.reset()
-        self._localized_ns = None
         self._state = TrackState.SEARCHING
         if self._scan_odometry is not None:
             self._scan_odometry.reset()
@@ -534,9 +531,8 @@ class LocalizerNode(LifecycleNode):
             while self._orders:
                 self._orders.popleft()(localizer, stamp_ns)
             self._guess_heading(localizer, stamp_ns)
-            estimate = localizer.localize(scan, gravity, T_base_lidar, self._motion_to(scan, T_base_lidar))
-            if len(estimate.candidates):
-                self._localized_ns = stamp_ns
+            motion = self._motion(localizer.stamp_ns, scan, T_base_lidar)
+            estimate = localizer.localize(scan, gravity, T_base_lidar, motion)
             self._state = estimate.state
             return Outcome(estimate, is_fault=False)
         except CrossLocError as error:
@@ -549,8 +545,9 @@ class LocalizerNode(LifecycleNode):
         """Return what comes of a message that says nothing: no fix, and no other state than before."""
         return Outcome(replace(no_estimate(stamp_ns, reason), state=self._state), is_fault=True)
 
-    def _motion_to(self, scan: Scan, T_base_lidar: Float64Array | None) -> Motion | None:
-        """Return how the robot moved since the last localized scan, None where nothing tells."""
+    def _motion(self, from_ns: int | None, scan: Scan, T_base_lidar: Float64Array | None) -> Motion | None:
+        """Return how the robot moved from the scan that the hypotheses stand at; None where there is none, or no
+        odometry."""
         if self._scan_odometry is not None:
             config = self._config.scan
             T = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
@@ -558,9 +555,7 @@ class LocalizerNode(LifecycleNode):
             used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
             self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points[used]).astype(np.float64))
         source = self._odometry or self._scan_odometry
-        if source is None or self._localized_ns is None:
-            return None
-        return source.motion(self._localized_ns, scan.stamp_ns)
+        return None if source is None or from_ns is None else source.motion(from_ns, scan.stamp_ns)
 
     def _guess_heading(self, localizer: Localizer, stamp_ns: int) -> None:
         """Hand on what the IMU says of the heading, as long as nothing better is known."""

@@ -40,13 +40,14 @@ class StandIn:
         self.calibration = effective_calibration(config.credibility, encoder)
         self.prior: Any = None
         self.resets = 0
+        self.stamp_ns: int | None = None
 
     def warm_up(self) -> None:
         self.encoder.warm_up()
         self.localize(Scan(np.zeros((1000, 3), np.float32), 0, "warm_up"))
 
     def reset(self) -> None:
-        self.prior = None
+        self.prior = self.stamp_ns = None
         self.resets += 1
 
     def set_prior(self, prior: Any) -> None:
@@ -58,6 +59,7 @@ class StandIn:
             return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts)
         descriptors = encode_query(self.encoder, prepared.patch.points)
         candidates = retrieve(descriptors, self.aerial_map, self.config.top_k, self.calibration)
+        self.stamp_ns = scan.stamp_ns
         probability = float(candidates.probabilities[0])
         is_fix = probability >= MIN_PROBABILITY
         frame = self.aerial_map.frame
