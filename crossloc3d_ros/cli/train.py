@@ -80,9 +80,43 @@ def _parser() -> argparse.ArgumentParser:
     curve.add_argument("run", type=Path, help="folder of the run")
     curve.add_argument("--output", type=Path, help="file to write (default: progress.html in the run)")
     curve.set_defaults(action=_curve)
-    for command in (places, run, export, card, curve):
+    alignment = commands.add_parser(
+        "alignment", help="learn how likely a beam is returned from what the aerial map shows, and what scores mean"
+    )
+    alignment.add_argument(
+        "--data",
+        type=Path,
+        default=Path("out/benchmark"),
+        help="folder in which pose sets are kept (default: %(default)s)",
+    )
+    alignment.add_argument("--weights", type=Path, help="weights of the set's map (default: the shipped ones)")
+    alignment.add_argument("--output", type=Path, required=True, help="file to write (.safetensors)")
+    alignment.set_defaults(action=_alignment)
+
+    for command in (places, run, export, card, curve, alignment):
         common.add_verbosity(command)
     return parser
+
+
+def _alignment(arguments: argparse.Namespace) -> int:
+    import functools
+
+    from crossloc3d_ros.encoder.checkpoint import load_encoder
+    from crossloc3d_ros.evaluation.pose_sets import open_pose_set
+    from crossloc3d_ros.training.alignment import fit_alignment
+
+    target = common.console()
+    with common.ProgressDisplay(target) as display:
+        loader = functools.partial(load_encoder, arguments.weights, "cpu", 1)
+        pose_set = open_pose_set("fitting", arguments.data, loader, progress=display)
+        model, answers = fit_alignment(pose_set, progress=display)
+    model.save(arguments.output)
+    found = sum(answer.right == 0 for answer in answers)
+    target.print(
+        f"{arguments.output}: {len(answers)} scans, {found} of them right at once; as likely here as not at "
+        f"{model.expected_share:.2f} of the expected score, odds times e for {model.temperature:.1f}"
+    )
+    return 0
 
 
 def _make_places(arguments: argparse.Namespace) -> int:

@@ -80,7 +80,7 @@ class Aligner:
         evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
         if len(evidence) < self.config.min_cells:
             return no_aligned_poses()
-        fine = evidence.some(_FINE_RETURNS, _FINE_PASSAGES)
+        fine = fine_evidence(evidence)
         found = self._found(evidence, candidates, exhaustive)
         followed = self._followed(hypotheses)
         poses = np.vstack([found.poses, followed])
@@ -183,6 +183,16 @@ class Aligner:
         easting, northing = poses[:, 0] + self.likelihood.west_m, poses[:, 1] + self.likelihood.south_m
         heights = [self.likelihood.terrain_height(float(e), float(n)) for e, n in zip(easting, northing, strict=True)]
         return np.column_stack([easting, northing, heights])
+
+
+def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int64Array:
+    """Return (CHANNELS,) how many cells of each channel a scan's scores are summed over."""
+    return fine_evidence(evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)).counts()
+
+
+def fine_evidence(evidence: Evidence) -> Evidence:
+    """Return as much of the evidence as poses are compared by at the end."""
+    return evidence.some(_FINE_RETURNS, _FINE_PASSAGES)
 
 
 def _repeated(poses: Float64Array) -> np.ndarray:

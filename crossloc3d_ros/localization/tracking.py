@@ -21,6 +21,7 @@ import numpy as np
 from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.localization.odometry import Motion, unknown_motion
 from crossloc3d_ros.types import (
+    EXHAUSTIVE,
     AlignedPoses,
     BoolArray,
     Float64Array,
@@ -198,7 +199,9 @@ class Tracker:
         births = self._births(poses, np.logaddexp(open_none, carried), aligned.log_prior, branches)
         self._mixture = branches[0].join(births)
         # Where it was missed so far, it may yet be found, the less likely the more spots it was missed at.
-        hope = self._elsewhere * (1.0 - news * config.found_share) * _STALE_SHARE
+        # A scan that was looked at around the hypotheses alone could not find it.
+        searched = bool((aligned.source >= 0).any() or (aligned.source == EXHAUSTIVE).any())
+        hope = self._elsewhere * ((1.0 - news * config.found_share) * _STALE_SHARE if searched else 1.0)
         hope += (1.0 - hope) * self._carried
         none = float(np.logaddexp(self._log_none, carried))
         self._elsewhere = float(np.exp(np.logaddexp(self._log_none + math.log(hope), carried) - none))
