@@ -111,6 +111,10 @@ def _parser() -> argparse.ArgumentParser:
         "--odometry", choices=["wheels", "scan", "none"], default="wheels",
         help="with --protocol pose: what tells along drives how the robot moves (default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N",
+        help="with --protocol pose, for a quick look: each n-th scan and each n-th journey (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK or pose_BENCHMARK)")
     parser.add_argument(
         "--data", type=Path, default=Path("out/benchmark"),
@@ -177,6 +181,8 @@ def _evaluate_poses(arguments: argparse.Namespace) -> None:
         "odometry": about.odometry,
         "data": about.data,
     }
+    if about.every > 1:
+        facts["a quick look"] = f"one scan and one journey of {about.every}"
     words = _AMSTERDAM_WORDS[:1] if about.pose_set == "amsterdam" else _SIMULATED_WORDS
     write_pose_page(
         output / PAGE, scores, f"Poses, {about.pose_set}: {about.weights}", facts, words,
@@ -192,6 +198,8 @@ def _evaluate_poses(arguments: argparse.Namespace) -> None:
 def _check_pose_options(arguments: argparse.Namespace) -> None:
     if arguments.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    if arguments.every < 1:
+        raise ConfigError(f"--every must be at least 1, got {arguments.every}")
     if arguments.dataset is not None or arguments.method != "weights" or arguments.setting or arguments.query_headings:
         raise ConfigError("--protocol pose knows neither --dataset, --method, --setting nor --query-headings")
 
@@ -207,7 +215,9 @@ def _predict_poses(
     drives = open_drives(pose_set, workers=arguments.workers, surveys=surveys, progress=display)
     journeys = journeys_of(pose_set, drives)
     predictions = predict_poses(pose_set, drives, journeys, loader, config, workers=arguments.workers, progress=display)
-    about = about_of(pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config, arguments.odometry)
+    about = about_of(
+        pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config, arguments.odometry, arguments.every
+    )
     save_pose_predictions(path, predictions, about)
 
 

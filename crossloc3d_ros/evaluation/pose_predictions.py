@@ -89,6 +89,8 @@ class PoseAbout:
     config: dict[str, Any] = field(default_factory=dict)
     """The localizer's settings."""
     odometry: Odometry = "wheels"
+    every: int = 1
+    """Each n-th scan and journey was asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,15 +148,19 @@ def predict(
     config: LocalizerConfig,
     *,
     odometry: Odometry = "wheels",
+    every: int = 1,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> PosePredictions:
-    """Ask the localizer for every single scan of a set and along every journey, in so many processes."""
+    """Ask the localizer for every single scan of a set and along every journey, in so many processes.
+
+    `every`: for a quick look, each n-th scan and each n-th journey alone.
+    """
     report = progress or (lambda stage, done, total, unit: None)
-    scans = range(len(pose_set.scans))
+    scans = range(0, len(pose_set.scans), every)
     singles = [tuple(scans[first : first + _SINGLES_AT_ONCE]) for first in range(0, len(scans), _SINGLES_AT_ONCE)]
-    steps = [len(steps_of(journey, drives)) for journey in journeys]
-    done, total = 0, len(scans) + sum(steps)
+    steps = {i: len(steps_of(journey, drives)) for i, journey in enumerate(journeys) if i % every == 0}
+    done, total = 0, len(scans) + sum(steps.values())
     report("localizing", done, total, "scans")
 
     def advance(count: int) -> None:
@@ -163,7 +169,7 @@ def predict(
         report("localizing", done, total, "scans")
 
     # The longest first, so that no worker is left alone with one at the end.
-    order = sorted(range(len(journeys)), key=lambda i: -steps[i])
+    order = sorted(steps, key=lambda i: -steps[i])
     where = (pose_set.folder, pose_set.map_folder)
     tasks = [_Task(*where, config, odometry, (i, journeys[i]), ()) for i in order]
     tasks += [_Task(*where, config, odometry, None, rows) for rows in singles]
@@ -391,14 +397,14 @@ def _in_order(predictions: PosePredictions) -> PosePredictions:
 
 
 def about_of(
-    pose_set: PoseSet, aerial_map: AerialMap, weights: str, config: LocalizerConfig, odometry: Odometry
+    pose_set: PoseSet, aerial_map: AerialMap, weights: str, config: LocalizerConfig, odometry: Odometry, every: int
 ) -> PoseAbout:
     """Return what the predictions say of themselves."""
     west, south, east, north = aerial_map.bounds
     return PoseAbout(
         pose_set.name, pose_set.folder.name, weights, aerial_map.manifest.encoder_fingerprint, pose_set.area_names,
         pose_set.families, pose_set.on_map, pose_set.groups, (east - west) * (north - south) / 1e6,
-        len(aerial_map.submaps), to_dict(config), odometry,
+        len(aerial_map.submaps), to_dict(config), odometry, every,
     )  # fmt: skip
 
 

@@ -202,6 +202,7 @@ def test_amsterdam_is_made_of_the_two_surveys(weights: Path, tmp_path: Path, mon
         (["--protocol", "pose", "--dataset", "data"], "knows neither"),
         (["--protocol", "pose", "--method", "scan_context"], "knows neither"),
         (["--protocol", "pose", "--workers", "0"], "at least 1"),
+        (["--protocol", "pose", "--every", "0"], "--every must be at least 1"),
         (["--protocol", "pose", "--set", "fusion"], "NAME=VALUE"),
         (["--protocol", "pose", "--set", "fusion.nonsense=1"], "unknown setting 'fusion.nonsense'"),
         (["--protocol", "pose", "--set", "fusion.min_probability=2"], "must lie between"),
