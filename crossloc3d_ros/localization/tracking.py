@@ -40,6 +40,7 @@ _STATE = 8  # numbers of a hypothesis' state
 _ODOMETRY_M = 200.0  # way over which the systematic error of odometry changes
 _SPOT_SCANS = 20.0  # scans of a spot that the average of its evidence remembers
 _LEAST_LOG_WEIGHT = math.log(1e-9)  # lighter hypotheses are dropped
+_LEAST_LOG_NONE = -1e4  # the belief in none falls no lower: what is carried away comes back by itself
 _LARGEST_STD_M = 150.0  # wider ones tell nothing
 _ANY_HEADING = math.pi**2 / 3.0  # variance of a heading of which nothing is known
 _STALE_SHARE = 0.97  # what a further scan of a spot that finds no pose leaves of the hope to find one there
@@ -369,14 +370,15 @@ class Tracker:
     def _normalize(self) -> None:
         """Scale the weights so that they and the belief in none sum to 1, and drop the lightest hypotheses."""
         total = float(np.logaddexp(_log_sum(self._mixture.log_weight), self._log_none))
-        self._log_none = max(self._log_none - total, 2.0 * _LEAST_LOG_WEIGHT)
+        self._log_none = max(self._log_none - total, _LEAST_LOG_NONE)
         log_weight = self._mixture.log_weight - total
         self._mixture = dataclasses.replace(self._mixture, log_weight=log_weight).take(log_weight > _LEAST_LOG_WEIGHT)
 
     def _normalize_none(self) -> None:
         """Give the belief in hypotheses that were dropped to none."""
-        none = 1.0 - float(np.exp(self._mixture.log_weight).sum())
-        self._log_none = math.log(max(none, math.exp(self._log_none)))
+        dropped = 1.0 - math.exp(self._log_none) - float(np.exp(self._mixture.log_weight).sum())
+        if dropped > 1e-12:
+            self._log_none = float(np.logaddexp(self._log_none, math.log(dropped)))
 
     # Judgement
 
