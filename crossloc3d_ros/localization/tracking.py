@@ -401,7 +401,7 @@ class Tracker:
             return Belief(state, reason, 0.0, nothing, math.nan, np.full((3, 3), np.nan), no_hypotheses(), False)
         weights = np.exp(mixture.log_weight)
         leader = int(np.argmax(weights))
-        grid, heading, covariance, near = _estimate(mixture, weights, leader, config.map_error_m)
+        grid, heading, covariance, near = _estimate(mixture, weights, leader, config)
         off = np.hypot(*(mixture.mean[:, :2] - grid[:2]).T)
         spread = np.linalg.eigvalsh(mixture.covariance[:, :2, :2] + np.eye(2) * config.map_error_m**2)[:, 1]
         # A lower bound: a circle around each hypothesis that the circle around the estimate holds.
@@ -696,7 +696,7 @@ def _merge(mixture: _Mixture, most: int) -> _Mixture:
 
 
 def _estimate(
-    mixture: _Mixture, weights: Float64Array, leader: int, map_error_m: float
+    mixture: _Mixture, weights: Float64Array, leader: int, config: FusionConfig
 ) -> tuple[Float64Array, float, Float64Array, BoolArray]:
     """Return position (3,), heading and covariance (3, 3) of the place around the leader, and who belongs to it."""
     off = mixture.mean[:, :3] - mixture.mean[leader, :3]
@@ -706,7 +706,8 @@ def _estimate(
     middle = shares @ off[near]
     rest = off[near] - middle
     covariance = np.einsum("b,bij->ij", shares, mixture.covariance[near, :3, :3]) + (rest * shares[:, None]).T @ rest
-    covariance[range(2), range(2)] += map_error_m**2
+    lasting = (config.map_error_m, config.map_error_m, math.radians(config.map_turn_deg))
+    covariance += np.diag(np.square(lasting))
     pose = mixture.mean[leader, :3] + middle
     grid = np.array([pose[0], pose[1], float(shares @ mixture.height[near])])
     return grid, float(_wrap(pose[2])), covariance, near
