@@ -6,7 +6,9 @@ import argparse
 import datetime
 import shlex
 import sys
+import typing
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,7 @@ from crossloc3d_ros.cli.common import (
     run,
     set_up_logging,
 )
-from crossloc3d_ros.config import LocalizerNodeConfig, MountingConfig, from_dict
+from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
 from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS
@@ -92,6 +94,11 @@ def _parser() -> argparse.ArgumentParser:
         "(default: topic, where the recording has one)",
     )
     localize.add_argument("--odom-topic", help="Odometry topic (default: the only one beside ground truth, or /odom)")
+    localize.add_argument(
+        "--search",
+        choices=typing.get_args(typing.get_type_hints(AlignmentConfig)["search"]),
+        help="where poses are sought (default: as the parameter alignment.search of the node)",
+    )
     localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
     localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
     localize.add_argument(
@@ -120,6 +127,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     target = console()
     set_up_logging(arguments.verbose, target)
     config = read_config(arguments.config, _given(arguments, MountingConfig), _given(arguments, LocalizerNodeConfig))
+    if arguments.search is not None:
+        config = replace(config, alignment=replace(config.alignment, search=arguments.search))
     if not config.map:
         raise ConfigError(f"--map is needed: {arguments.config} names none")
     folder = arguments.output or Path("out") / "replay" / arguments.bag.resolve().stem

@@ -292,7 +292,9 @@ def _range_words(low: float, high: float) -> str:
 
 
 def _exact(share: float) -> str:
-    return percent(share) if not math.isfinite(share) or share in (0.0, 1.0) else f"{100 * share:.1f} %"
+    if not math.isfinite(share) or share in (0.0, 1.0):
+        return percent(share)
+    return f"{100 * share:.1f} %" if share < 0.9995 else f"{100 * min(share, 0.9999):.2f} %"
 
 
 # Altogether
@@ -305,7 +307,8 @@ def cdf_chart(table: EstimateTable, scores: Scores | None, submaps: Float64Array
     scored = np.isfinite(table.truth_grid).all(axis=1)
     distances = _candidate_errors(table)[scored]
     fixes = table.error_m[scored & table.has_fix]
-    aligned = np.hypot(*(table.first_aligned[0] - table.truth_grid).T)[scored]
+    aligned = np.hypot(*(table.first_aligned[0] - table.truth_grid).T)
+    aligned = aligned[np.isfinite(aligned)]
     widest = float(np.max(distances[np.isfinite(distances)], initial=250.0))
     tracked = table.has_track
     chart = charts.Chart(
@@ -321,7 +324,7 @@ def cdf_chart(table: EstimateTable, scores: Scores | None, submaps: Float64Array
         best = np.fmin.reduce(distances[:, :rank], axis=1) if distances.shape[1] else np.full(len(distances), np.nan)
         marks.append(chart.line(at, charts.cumulative(best, len(distances), at), f"s-{rank}"))
     keys = [("wrong", "first candidate"), ("far", "best of five"), ("fair", "best of 25")]
-    if np.isfinite(aligned).any():
+    if len(aligned):
         marks.append(chart.line(at, charts.cumulative(aligned, len(aligned), at), "s-aligned"))
         keys.insert(0, ("aligned", "first aligned pose"))
     if len(fixes):

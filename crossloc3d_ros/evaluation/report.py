@@ -219,36 +219,48 @@ def _search_table(track: TrackScores) -> str:
 def _steps_table(table: EstimateTable, frame: MapFrame) -> str:
     """Return how many scans each step alone puts right, of all scans whose truth is known."""
     known = np.isfinite(table.truth_grid).all(axis=1)
-    total = int(known.sum())
     candidates = horizontal_distances(table.candidate_grid, table.truth_grid)
     place, heading = table.first_aligned
     aligned = np.hypot(*(place - table.truth_grid).T)
+    looked = known & np.isfinite(aligned)
     turn = np.abs(np.degrees(wrapped(heading - table.truth_heading_rad - grid_turn_rad(table, frame))))
     fix = np.where(table.has_fix, table.error_m, np.inf)
     fix_turn = np.abs(np.degrees(table.heading_error_rad))
     heads = ("within 25 m", "within 10 m", "within 2 m", "within 2 m and 5°")
     nothing = np.full(len(table), np.inf)
     steps = (
-        ("retrieval", "the first square", candidates[:, 0] if candidates.shape[1] else nothing, nothing),
-        ("+ alignment", "the likeliest aligned pose", aligned, turn),
-        ("+ following", "the fix, where one is given", fix, fix_turn),
+        (
+            "retrieval",
+            f"the first square, {known.sum():,} scans",
+            known,
+            candidates[:, 0] if candidates.shape[1] else nothing,
+            nothing,
+        ),
+        ("+ alignment", f"the likeliest aligned pose, {looked.sum():,} scans", looked, aligned, turn),
+        ("+ following", f"the fix, where one is given, {known.sum():,} scans", known, fix, fix_turn),
     )
     rows = []
-    for name, what, off, turned in steps:
+    for name, what, among, off, turned in steps:
         cells = []
         for column, limit in enumerate((25.0, 10.0, 2.0, 2.0)):
-            hit = (off <= limit) & ((turned <= 5.0) if column == 3 else True) & known
-            share = float(hit.sum()) / max(total, 1)
-            unknown = (column == 3 and not np.isfinite(turned[known]).any()) or (name == "retrieval" and limit < 10.0)
+            hit = (off <= limit) & ((turned <= 5.0) if column == 3 else True) & among
+            share = float(hit.sum()) / max(int(among.sum()), 1)
+            unknown = (
+                not among.any()
+                or (column == 3 and not np.isfinite(turned[among]).any())
+                or (name == "retrieval" and limit < 10.0)
+            )
             gauge = f'<div class="gauge"><i style="width:{100 * share:.1f}%"></i></div>'
             cells.append("<td>–</td>" if unknown else f"<td><b>{percent(share)}</b>{gauge}</td>")
         rows.append(f"<tr><th scope='row'>{name}<small>{what}</small></th>{''.join(cells)}</tr>")
     head = "".join(f"<th scope='col'>{text}</th>" for text in heads)
     return (
-        f'<div class="scroll"><table class="recall"><thead><tr><th scope="col">Share of {total:,} scans</th>{head}</tr>'
+        f'<div class="scroll"><table class="recall"><thead><tr><th scope="col">Share of the scans</th>{head}</tr>'
         f"</thead><tbody>{''.join(rows)}</tbody></table></div>"
-        '<p class="below">The first two rows look at one scan alone, as if the robot had just been switched on, and '
-        "count every scan, believed or not; the last one gives no fix where it is not sure.</p>"
+        '<p class="below">The first two rows look at one scan alone, as if the robot had just been switched on, '
+        "believed or not; of aligned poses count those that were found around the candidates or on the whole map, "
+        "which are looked for at every scan only while the place is not known. The last row gives no fix where it is "
+        "not sure.</p>"
     )
 
 

@@ -32,8 +32,8 @@
   const metres = value => value === null ? "–" : value >= 1000 ? (value / 1000).toFixed(1) + " km"
     : value >= 9.95 || !data.tracked ? Math.round(value) + " m" : value.toFixed(value >= 0.995 ? 1 : 2) + " m";
   const degrees = value => value === null ? "–" : value.toFixed(Math.abs(value) >= 9.95 ? 0 : 1) + "°";
-  const percent = value => value === null ? "–" : value < 0.995 ? (100 * value).toFixed(1) + " %"
-    : (100 * Math.floor(1e5 * value) / 1e5).toFixed(value === 1 ? 0 : 2) + " %";
+  const percent = value => value === null ? "–" : value > 0.9999 ? "> 99.99 %" : value > 0 && value < 0.0005 ? "< 0.1 %"
+    : (100 * value).toFixed(value > 0.995 ? 2 : 1) + " %";
   const offBy = (scan, x, y) => scan.truth ? Math.hypot(x - scan.truth[0], y - scan.truth[1]) : null;
   const between = (a, b) => a === null || b === null ? null : ((a - b) % 360 + 540) % 360 - 180;
   const state = scan => {
