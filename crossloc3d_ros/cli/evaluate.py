@@ -214,7 +214,10 @@ def _predict_poses(
     )
     drives = open_drives(pose_set, workers=arguments.workers, surveys=surveys, progress=display)
     journeys = journeys_of(pose_set, drives)
-    predictions = predict_poses(pose_set, drives, journeys, loader, config, workers=arguments.workers, progress=display)
+    predictions = predict_poses(
+        pose_set, drives, journeys, loader, config,
+        odometry=arguments.odometry, every=arguments.every, workers=arguments.workers, progress=display,
+    )  # fmt: skip
     about = about_of(
         pose_set, AerialMap.load(pose_set.map_folder), _label(arguments), config, arguments.odometry, arguments.every
     )
