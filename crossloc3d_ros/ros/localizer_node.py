@@ -361,6 +361,7 @@ class LocalizerNode(LifecycleNode):
             self._config = self._configuration.config
             self._localizer = type(self._localizer)(self._localizer.aerial_map, self._localizer.encoder, self._config)
             self._forget()
+            self.get_logger().info("localizing anew, with other settings")
 
     # Input
 
@@ -533,6 +534,8 @@ class LocalizerNode(LifecycleNode):
             self._guess_heading(localizer, stamp_ns)
             motion = self._motion(localizer.stamp_ns, scan, T_base_lidar)
             estimate = localizer.localize(scan, gravity, T_base_lidar, motion)
+            if not len(estimate.candidates):  # nothing that could have changed what is known
+                estimate = replace(estimate, state=self._state)
             self._state = estimate.state
             return Outcome(estimate, is_fault=False)
         except CrossLocError as error:
@@ -602,11 +605,19 @@ class LocalizerNode(LifecycleNode):
         """Say where the odometry's frame lies, as long as the odometry knows the robot's pose at the scan's stamp."""
         if self._map_transform is None or self._odometry is None or estimate.state is not TrackState.LOCALIZED:
             return
+        child_frame_id = self._odometry.frame_id
+        if child_frame_id in ("", self._config.global_frame_id):
+            self.get_logger().warning(
+                f"no transform is published: the odometry names '{child_frame_id}' as its frame, which must be one of "
+                "its own (REP-105)",
+                throttle_duration_sec=REPEAT_REASON_S,
+            )
+            return
         T_odom_base = self._odometry.pose_at(estimate.stamp_ns)
         if T_odom_base is None or not np.isfinite(estimate.T_map_base).all():
             return
         T_map_odom = estimate.T_map_base @ np.linalg.inv(T_odom_base)
-        self._map_transform.send(estimate.stamp_ns, T_map_odom, self._odometry.frame_id)
+        self._map_transform.send(estimate.stamp_ns, T_map_odom, child_frame_id)
 
     def _tell(self, outcome: Outcome) -> None:
         """Log the first result, every change between fix and no fix, and now and then why there is no fix."""

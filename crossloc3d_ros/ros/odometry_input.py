@@ -20,8 +20,8 @@ from crossloc3d_ros.types import Float64Array
 
 SILENCE_S = 1.0
 """A source that has been silent for so long is not waited for, and is told of."""
-_KEPT = 400
-"""Whole poses kept: two seconds at 200 Hz, far more than a scan takes."""
+_KEPT = 2000
+"""Whole poses kept: ten seconds at 200 Hz, far more than a scan takes."""
 
 
 @dataclass(frozen=True)

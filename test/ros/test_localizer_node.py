@@ -162,11 +162,11 @@ def test_the_state_is_latched_and_says_why(active: Robot, world: World) -> None:
     assert late[0].message == message
     level, message, values = active.told(active.message(np.full((20_000, 3), np.nan)))
     assert level == 1
-    assert message.startswith("searching: 0 of 20,000 points left")
+    assert message.startswith("localized: 0 of 20,000 points left"), "such a scan changes nothing that is known"
     assert values["fix"] == "no"
     # Who joins in a silence shall not take an old state for the present.
     active.wait_until(lambda: late[-1].level == DiagnosticStatus.STALE, what="for the state to be stale")
-    assert late[-1].message.startswith("searching when last seen: no cloud on /points for")
+    assert late[-1].message.startswith("localized when last seen: no cloud on /points for")
     active.node.destroy_subscription(subscription)
 
 
