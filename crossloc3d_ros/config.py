@@ -141,10 +141,11 @@ class FusionConfig:
     """From the aligned poses of scan after scan, and odometry, to one pose that may be driven by."""
 
     min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
-    confirm_m: float = option(3.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
+    confirm_m: float = option(5.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
     max_hypotheses: int = option(10, "poses carried along at most", low=1, high=1000)
     evidence_m: float = option(20.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
     evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
+    evidence_limit: float = option(15.0, "no scan tells more than this logarithm for the map", low=1.0, high=1000.0)
     blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
     found_share: float = option(
         0.7, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
@@ -204,7 +205,7 @@ class LocalizerNodeConfig(LocalizerConfig):
     odometry: Literal["topic", "scan", "none"] = option(
         "topic", "how the robot has moved: told on topic odom, from scan to scan (the extra 'odometry'), or unknown"
     )
-    odometry_wait_s: float = option(0.05, "how long a scan waits for the odometry of its stamp", low=0.0, high=1.0)
+    odometry_wait_s: float = option(0.02, "how long a scan waits for the odometry of its stamp", low=0.0, high=1.0)
     publish_tf: bool = option(False, "publish global_frame_id -> odometry frame on /tf while localized (REP-105)")
     tf_tolerance_s: float = option(0.2, "how far ahead of its scan that transform is stamped", low=0.0, high=10.0)
 

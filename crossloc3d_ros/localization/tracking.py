@@ -243,30 +243,28 @@ class Tracker:
 
     def _take_in_priors(self, stamp_ns: int) -> None:
         for prior in self._priors:
+            if prior.grid is None or not np.isfinite(prior.grid).all():
+                continue
             covariance = np.array(prior.covariance, dtype=np.float64)
-            assert prior.grid is not None
-            heading = prior.heading_rad
+            heading = prior.heading_rad if prior.heading_rad is not None and math.isfinite(prior.heading_rad) else None
             if heading is None or not np.isfinite(covariance[2]).all():
                 covariance[2, :] = covariance[:, 2] = 0.0
                 covariance[2, 2] = _ANY_HEADING
-            covariance = np.clip(covariance, -(_LARGEST_STD_M**2), _LARGEST_STD_M**2)
+            covariance = np.nan_to_num(covariance, nan=0.0, posinf=_LARGEST_STD_M**2, neginf=0.0)
             if prior.stamp_ns and stamp_ns > prior.stamp_ns:
                 # Where it has driven since is not asked for: it may lie anywhere on that way.
                 covariance[:2, :2] += np.eye(2) * (self._moved_m or 0.0) ** 2
-            belief = self._config.prior_belief
-            self._mixture = dataclasses.replace(
-                self._mixture, log_weight=self._mixture.log_weight + math.log1p(-belief)
-            )
-            self._log_none += math.log1p(-belief)
+            log_belief = math.log(self._config.prior_belief)
+            log_rest = math.log1p(-self._config.prior_belief)
+            self._log_none += log_rest
+            rest = dataclasses.replace(self._mixture, log_weight=self._mixture.log_weight + log_rest)
             born = _born(
-                prior.grid[None],
-                np.array([heading or 0.0]),
-                covariance[None],
-                np.array([math.log(belief)]),
-                self._config,
-            )
+                prior.grid[None], np.array([heading or 0.0]), _at_least(covariance[None], 0.1, 0.5),
+                np.array([log_belief]), self._config,
+            )  # fmt: skip
+            # Whoever gives a pose has confirmed it; the first scan is the first look at its spot.
             born = dataclasses.replace(born, followed_m=np.array([np.inf]), looks=np.zeros(1))
-            self._mixture = self._mixture.join(born)
+            self._mixture = rest.join(born)
             self._unknown_reason = ""
         self._priors = []
 
@@ -293,14 +291,19 @@ class Tracker:
         )
         offsets = _offsets(aligned.grid[rows, :2], aligned.heading_rad[rows])
         near = _squared(offsets, covariance[:, None] + covariance[None]) < _SAME
-        kept = np.array([not near[i, :i].any() for i in range(len(rows))], dtype=np.bool_)
+        kept: list[int] = []
+        for i in range(len(rows)):
+            if not near[i, kept].any():
+                kept.append(i)
         rows, covariance = rows[kept], covariance[kept]
+        log_likelihood = config.evidence_weight * aligned.log_likelihood[rows]
+        # However well a scan fits somewhere: a place that the map does not hold may look so, too.
+        log_likelihood -= max(float(log_likelihood.max(initial=0.0)) - config.evidence_limit, 0.0)
         return AlignedPoses(
             grid=aligned.grid[rows],
             heading_rad=aligned.heading_rad[rows],
             covariance=covariance,
-            log_likelihood=config.evidence_weight * aligned.log_likelihood[rows]
-            + self._of_compass(aligned.heading_rad[rows]),
+            log_likelihood=log_likelihood + self._of_compass(aligned.heading_rad[rows]),
             probabilities=aligned.probabilities[rows],
             inliers=aligned.inliers[rows],
             converged=aligned.converged[rows],
