@@ -129,7 +129,7 @@ class AlignmentConfig:
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
     follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
-    peaks: int = option(32, "places of the coarse search that are looked at more closely", low=1, high=1000)
+    peaks: int = option(48, "places of the coarse search that are looked at more closely", low=1, high=1000)
     poses: int = option(12, "of these, how many in the finest cells", low=1, high=1000)
     min_cells: int = option(100, "a scan that saw fewer cells says nothing", low=1, high=100_000)
     place_m2: float = option(100.0, "area of the map that counts as one place before a scan", low=0.01, high=1e6)

@@ -32,14 +32,16 @@ from crossloc3d_ros.localization.search import (
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import EXHAUSTIVE, AlignedPoses, Float64Array, Hypotheses, Int64Array, no_aligned_poses
 
-_COARSE_RETURNS, _COARSE_PASSAGES = 250, 300
+_COARSE_RETURNS, _COARSE_PASSAGES = 160, 200
 _MIDDLE_RETURNS, _MIDDLE_PASSAGES = 500, 500
+_CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
 _FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
 _COARSE_HEADINGS = 48
 _APART_M = 8.0
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
-_SHAPE_STEPS_M = np.array([-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5])
-_SHAPE_STEPS_RAD = np.radians([-2.0, -1.0, 0.0, 1.0, 2.0])
+_SHAPE_STEPS_M = np.array([-1.2, -0.6, 0.0, 0.6, 1.2])
+_SHAPE_STEPS_RAD = np.radians([-1.5, 0.0, 1.5])
+_SHAPE = np.stack(np.meshgrid(_SHAPE_STEPS_M, _SHAPE_STEPS_M, _SHAPE_STEPS_RAD, indexing="ij"), -1).reshape(-1, 3)
 _LEAST_STD_M, _LEAST_STD_RAD = 0.1, math.radians(0.2)
 
 
@@ -87,14 +89,16 @@ class Aligner:
         if not len(poses):
             return no_aligned_poses()
         reach = np.concatenate([np.full(len(found.poses), 6.0), np.full(len(followed), self.config.follow_m)])
-        peaks, rested = climb(fine, self.likelihood, poses, reach_m=float(reach.max()))
+        some = fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
+        climbed, rested = climb(some, self.likelihood, poses, reach_m=float(reach.max()))
+        peaks = Peaks(climbed.poses, scores_at(fine, self.likelihood, climbed.poses))
         source = self._sources(peaks, len(found.poses), candidates, exhaustive)
         kept = self._kept(peaks, len(found.poses))
         counts = fine.counts()
         log_likelihood = self.model.log_likelihood(peaks.scores, counts)
         kept = kept[np.argsort(-peaks.scores[kept], kind="stable")]
         chosen = peaks.poses[kept]
-        covariance = np.array([self._covariance(fine, pose) for pose in chosen]).reshape(-1, 3, 3)
+        covariance = np.array([self._covariance(some, len(fine), pose) for pose in chosen]).reshape(-1, 3, 3)
         log_odds = log_likelihood[kept] + self.log_prior
         # A hypothesis and a peak of the search may be one pose: it counts once.
         counted = log_odds.copy()
@@ -162,16 +166,15 @@ class Aligner:
         first = Peaks(peaks.poses[:found], peaks.scores[:found])
         return np.concatenate([merge(first, _SAME_M, _SAME_RAD), np.arange(found, len(peaks.scores))])
 
-    def _covariance(self, evidence: Evidence, pose: Float64Array) -> Float64Array:
-        """Return the covariance (3, 3) of a pose from the shape of the score around it."""
-        steps = np.stack(np.meshgrid(_SHAPE_STEPS_M, _SHAPE_STEPS_M, _SHAPE_STEPS_RAD, indexing="ij"), -1).reshape(
-            -1, 3
-        )
-        scores = scores_at(evidence.some(500, 500), self.likelihood, pose + steps)
-        scores *= len(evidence) / max(len(evidence.some(500, 500)), 1)
+    def _covariance(self, some: Evidence, cells: int, pose: Float64Array) -> Float64Array:
+        """Return the covariance (3, 3) of a pose from the shape of the score around it.
+
+        `some` of the `cells` of the whole evidence stand for all.
+        """
+        scores = scores_at(some, self.likelihood, pose + _SHAPE) * (cells / max(len(some), 1))
         weights = np.exp((scores - scores.max()) / self.config.shape_temperature)
         weights /= weights.sum()
-        offsets = steps - weights @ steps
+        offsets = _SHAPE - weights @ _SHAPE
         spread = (offsets * weights[:, None]).T @ offsets
         return np.asarray(spread + np.diag([_LEAST_STD_M**2, _LEAST_STD_M**2, _LEAST_STD_RAD**2]))
 
