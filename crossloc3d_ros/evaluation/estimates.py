@@ -150,7 +150,7 @@ class EstimateTable:
     truth_heading_rad: Float64Array
     """(S,) counter-clockwise from true east; NaN where unknown."""
     states: tuple[TrackState | None, ...]
-    """(S,); None where the file does not say."""
+    """(S,); None where the file does not say, and for scans that got no answer or could not be used."""
     probability: Float64Array
     """(S,) belief that the horizontal error is below 10 m; NaN where the file does not say."""
     heading_rad: Float64Array
@@ -239,7 +239,8 @@ class EstimateWriter:
             _number(estimate.altitude_m, 3),
             *(_number(value, 3) for value in estimate.grid),
             *(_number(value, 4) for value in covariance),
-            estimate.state.value,
+            # A scan that was dropped, or could not be used, has changed nothing: the state is not its to tell.
+            estimate.state.value if math.isfinite(estimate.probability) else "",
             _number(estimate.probability, 6),
             _number(math.degrees(heading_of(estimate.T_map_base)), 4),
             _number(math.degrees(_std(estimate.pose_covariance[5, 5])), 4),

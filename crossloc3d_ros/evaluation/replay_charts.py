@@ -22,6 +22,8 @@ POSE_CLASSES = ((1.0, "near", "fix within 1 m"), (3.0, "fair", "within 3 m"), (W
 WORST = ("wrong", "farther off")
 _WIDE = 1160.0
 _LOW_M = 0.02
+_STATE_HOLDS_S = 2.0
+"""So long a state is drawn on after the scan that told it, where no other scan tells one."""
 _NOT_KNOWN = "<p>Not known: the recording has no position to compare with.</p>"
 STATE_WORDS = {
     TrackState.SEARCHING: "searching",
@@ -91,20 +93,23 @@ def _state_strip(table: EstimateTable) -> str:
         foot=8.0,
     )
     states = table.states
+    known = [i for i, state in enumerate(states) if state is not None]
     marks, begin = [], 0
-    for i in range(1, len(states) + 1):
-        if i < len(states) and states[i] is states[begin]:
+    for j in range(1, len(known) + 1):
+        first, last = known[begin], known[j - 1]
+        following = known[j] if j < len(known) else last
+        is_gap = seconds[following] - seconds[last] > _STATE_HOLDS_S
+        if j < len(known) and states[following] is states[first] and not is_gap:
             continue
-        state = states[begin]
-        until = seconds[min(i, len(states) - 1)]
+        state, until = states[first], seconds[last] if is_gap else seconds[following]
         if state is not None:
-            left, right = chart.x_px(seconds[begin]), chart.x_px(until)
+            left, right = chart.x_px(seconds[first]), chart.x_px(until)
             marks.append(
                 f'<rect class="state-{state.value}" x="{left:.2f}" y="{chart.y_px(1.0):g}" '
                 f'width="{max(0.7, right - left):.2f}" height="{chart.y_px(0.0) - chart.y_px(1.0):g}">'
-                f"<title>{STATE_WORDS[state]}, {seconds[begin]:.1f} to {until:.1f} s</title></rect>"
+                f"<title>{STATE_WORDS[state]}, {seconds[first]:.1f} to {until:.1f} s</title></rect>"
             )
-        begin = i
+        begin = j
     seen = {state for state in states if state is not None}
     legend = "".join(
         f'<span><i class="key state-{state.value}"></i>{STATE_WORDS[state]}</span>'

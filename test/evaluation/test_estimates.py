@@ -138,7 +138,7 @@ def test_poses_are_read_again(tmp_path: Path) -> None:
     rows = [posed(0), posed(1, aligned=0, hypotheses=5, heading_rad=-3.1), estimate(2, candidates=0)]
     table = estimates.read_estimates(write(tmp_path / "e.csv", rows))
     assert table.has_track
-    assert table.states == (TrackState.LOCALIZED, TrackState.LOCALIZED, TrackState.SEARCHING)
+    assert table.states == (TrackState.LOCALIZED, TrackState.LOCALIZED, None)  # the last one tells nothing
     np.testing.assert_allclose(table.probability, [0.99925, 0.99925, np.nan])
     np.testing.assert_allclose(table.heading_rad, [0.3, -3.1, np.nan], atol=2e-6)
     np.testing.assert_allclose(table.heading_std_rad[:2], 0.02, rtol=1e-4)

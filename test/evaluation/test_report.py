@@ -273,6 +273,19 @@ def test_the_script_gets_poses_in_the_frame_of_the_map(town_map: AerialMap, tmp_
         assert (scan["turned"] is None) == (not table.has_fix[i])
 
 
+def test_states_are_drawn_on_over_scans_that_tell_none(town_map: AerialMap, tmp_path: Path) -> None:
+    """Ten scans a second, of which every third is answered; then none for three seconds, then another state."""
+    table = tracked(made_up_table(town_map, scans=61), town_map)
+    states: list[TrackState | None] = [None] * 61
+    states[0:22:3] = [TrackState.AMBIGUOUS] * 8
+    states[51:61:3] = [TrackState.LOCALIZED] * 4
+    _, page = page_of(replace(table, states=tuple(states)), town_map, tmp_path / "page.html")
+    words = " ".join(page.words)
+    assert "several places, 0.0 to 2.1 s" in words
+    assert "localized, 5.1 to 6.0 s" in words
+    assert words.count("several places, ") == words.count("localized, 5") == 1
+
+
 def test_one_scan_alone_is_not_credited_with_what_earlier_ones_found(town_map: AerialMap) -> None:
     table = tracked(made_up_table(town_map, scans=6), town_map)
     grid, heading = table.first_aligned
