@@ -472,8 +472,13 @@ def test_parameters_carry_description_and_range(active: Robot) -> None:
 
 
 def test_the_lifecycle_goes_round(active: Robot, world: World) -> None:
+    active.localize(world.points(6))
     assert active.change_state(Transition.TRANSITION_DEACTIVATE)
     assert active.state() == "inactive"
+    active.wait_until(
+        lambda: active.states and active.states[-1].message == "localized when last seen: inactive",
+        what="for the state to be stale",
+    )
     active.wait_until(lambda: active.clouds.get_subscription_count() == 0, what="for the node to stop listening")
     assert active.diagnosis()[:2] == (0, "inactive")
     assert active.change_state(Transition.TRANSITION_CLEANUP)
