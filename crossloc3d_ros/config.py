@@ -143,7 +143,7 @@ class FusionConfig:
     min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
     confirm_m: float = option(5.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
     max_hypotheses: int = option(10, "poses carried along at most", low=1, high=1000)
-    evidence_m: float = option(20.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
+    evidence_m: float = option(15.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
     evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
     evidence_limit: float = option(15.0, "no scan tells more than this logarithm for the map", low=1.0, high=1000.0)
     blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
@@ -152,13 +152,13 @@ class FusionConfig:
     )
     carried_per_s: float = option(1e-4, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
     prior_belief: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)
-    error_scale: float = option(1.0, "factor on the standard deviations of aligned poses", low=0.1, high=100.0)
+    error_scale: float = option(1.5, "factor on the standard deviations of aligned poses", low=0.1, high=100.0)
     error_share: float = option(
-        0.8, "share of an aligned pose's variance that the next scan's error has in common", low=0.0, high=0.99
+        0.3, "share of an aligned pose's variance that the next scan's error has in common", low=0.0, high=0.99
     )
-    error_m: float = option(5.0, "way over which that common error changes", low=0.1, high=1000.0)
-    position_floor_m: float = option(0.1, "least standard deviation of an aligned pose", low=0.01, high=10.0)
-    heading_floor_deg: float = option(0.2, "the same of its heading", low=0.01, high=10.0)
+    error_m: float = option(15.0, "way over which that common error changes", low=0.1, high=1000.0)
+    position_floor_m: float = option(0.2, "least standard deviation of an aligned pose", low=0.01, high=10.0)
+    heading_floor_deg: float = option(0.4, "the same of its heading", low=0.01, high=10.0)
     map_error_m: float = option(0.1, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
     map_turn_deg: float = option(0.2, "the same of every heading", low=0.0, high=10.0)
     odometry_error: float = option(0.05, "of odometry, one sigma, share of the way and of the turn", low=1e-4, high=1.0)
