@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import threading
 import time
 from collections import deque
@@ -92,7 +93,7 @@ class OdometryInput:
         """Return `T_odom_base` (4, 4) at a stamp between two samples, None where odometry does not tell it."""
         with self._heard:
             poses = list(self._poses)
-        after = next((i for i, (stamp, _) in enumerate(poses) if stamp >= stamp_ns), len(poses))
+        after = bisect.bisect_left(poses, stamp_ns, key=lambda pose: pose[0])
         if after == len(poses):
             return None
         (end_ns, T_end) = poses[after]
