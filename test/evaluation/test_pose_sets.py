@@ -276,3 +276,16 @@ def test_every_drive_begins_a_journey_and_robots_are_carried_to_other_towns() ->
         one, other = (leg.drive for leg in journey.legs)
         assert one != other
         assert pose_set.on_map[drives[other].plan.area]
+
+
+def test_the_long_drive_is_begun_anew_each_hundred_metres() -> None:
+    drives = [made_up("long", 0.0, 0, 400), made_up("one", 0.0, 0, 100), made_up("other", 0.0, 0, 100)]
+    pose_set = PoseSet("amsterdam", Path(), RawScans.of([]), ("a",), ("a",), (True,), ("g",), Path())
+    journeys = journeys_of(pose_set, drives)
+    starts = [journey.legs[0] for journey in journeys if journey.legs[0].drive == 0]
+    assert [(leg.from_m, leg.to_m) for leg in starts[1:]] == [(100.0, 200.0), (200.0, 300.0), (300.0, 400.0)]
+    assert starts[0] == Leg(0)
+    steps = steps_of(Journey((starts[2],)), drives)
+    assert [step.row for step in steps] == list(range(200, 300))
+    assert steps[0].travelled_m == 0.0
+    assert all(len(journey.legs) == 2 for journey in journeys if journey.legs[0].drive > 0)
