@@ -205,7 +205,7 @@ class Tracker:
         hope = self._elsewhere * ((1.0 - news * config.found_share) * _STALE_SHARE if searched else 1.0)
         hope += (1.0 - hope) * self._carried
         none = float(np.logaddexp(self._log_none, carried))
-        self._elsewhere = float(np.exp(np.logaddexp(self._log_none + math.log(hope), carried) - none))
+        self._elsewhere = max(float(np.exp(np.logaddexp(self._log_none + math.log(hope), carried) - none)), 1e-12)
         self._log_none, self._moved_m, self._carried = none, 0.0, 0.0
         self._normalize()
         self._mixture = _merge(self._mixture, config.max_hypotheses)
@@ -410,7 +410,7 @@ class Tracker:
         # A lower bound: a circle around each hypothesis that the circle around the estimate holds.
         inside = -np.expm1(-0.5 * np.maximum(RIGHT_WITHIN_M - off, 0.0) ** 2 / spread)
         probability = float(weights @ inside)
-        followed = mixture.followed_m[leader]
+        followed = mixture.followed_m[near].max()
         enough = probability >= config.min_probability
         is_fix = enough and followed >= config.confirm_m
         belief = float(weights[near].sum())
@@ -424,6 +424,8 @@ class Tracker:
             else:
                 state = TrackState.LOST if self._was_localized else TrackState.SEARCHING
             reason = self._why_not(mixture, weights, near, probability, belief, none, enough, float(followed))
+            if none < 0.5:
+                reason += _odometry_fault(mixture, leader, config)
             if self._unknown_reason:
                 reason += f", since the motion was unknown: {self._unknown_reason}"
         return Belief(state, reason, probability, grid, heading, covariance, self._hypotheses(), is_fix)
