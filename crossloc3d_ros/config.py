@@ -129,8 +129,9 @@ class AlignmentConfig:
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
     follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
-    peaks: int = option(48, "places of the coarse search that are looked at more closely", low=1, high=1000)
+    peaks: int = option(64, "poses around the candidates that are looked at more closely", low=1, high=1000)
     poses: int = option(12, "of these, how many in the finest cells", low=1, high=1000)
+    descriptor_weight: float = option(0.5, "of the candidates' belief beside the alignment's", low=0.0, high=10.0)
     min_cells: int = option(100, "a scan that saw fewer cells says nothing", low=1, high=100_000)
     place_m2: float = option(100.0, "area of the map that counts as one place before a scan", low=0.01, high=1e6)
     shape_temperature: float = option(20.0, "score that makes a pose e times likelier than its neighbour", low=0.01)
@@ -148,7 +149,7 @@ class FusionConfig:
     evidence_limit: float = option(15.0, "no scan tells more than this logarithm for the map", low=1.0, high=1000.0)
     blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
     found_share: float = option(
-        0.7, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
+        0.9, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
     )
     carried_per_s: float = option(1e-4, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
     prior_belief: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)

@@ -206,6 +206,11 @@ class Estimate:
     hypotheses: Hypotheses = field(default_factory=lambda: no_hypotheses())
 
 
+def no_candidates() -> Candidates:
+    """Return the candidates of a scan that nothing was retrieved for."""
+    return Candidates(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0), np.empty((0, 3)))
+
+
 def no_aligned_poses() -> AlignedPoses:
     """Return the poses of a scan that fits nowhere, or that was not aligned."""
     none = np.empty(0)

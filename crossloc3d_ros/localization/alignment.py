@@ -30,7 +30,15 @@ from crossloc3d_ros.localization.search import (
     wrapped,
 )
 from crossloc3d_ros.places.store import AerialMap
-from crossloc3d_ros.types import EXHAUSTIVE, AlignedPoses, Float64Array, Hypotheses, Int64Array, no_aligned_poses
+from crossloc3d_ros.types import (
+    EXHAUSTIVE,
+    AlignedPoses,
+    Candidates,
+    Float64Array,
+    Hypotheses,
+    Int64Array,
+    no_aligned_poses,
+)
 
 _COARSE_RETURNS, _COARSE_PASSAGES = 160, 200
 _MIDDLE_RETURNS, _MIDDLE_PASSAGES = 500, 500
@@ -38,6 +46,8 @@ _CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
 _FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
 _COARSE_HEADINGS = 48
 _APART_M = 8.0
+_PLACE_M = 35.0  # so far from the centre of its submap a pose still is of its place
+_UNSEEN = 0.2  # likelihood ratio of a place that is not among the candidates
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
 _SHAPE_STEPS_M = np.array([-1.2, -0.6, 0.0, 0.6, 1.2])
 _SHAPE_STEPS_RAD = np.radians([-1.5, 0.0, 1.5])
@@ -70,94 +80,109 @@ class Aligner:
             self.likelihood.prepare()
 
     def align(
-        self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Float64Array,
-        hypotheses: Hypotheses | None = None, *, exhaustive: bool = False,
-    ) -> AlignedPoses:  # fmt: skip
+        self,
+        prepared: PreparedScan,
+        sensor_xy_m: tuple[float, float],
+        candidates: Candidates,
+        hypotheses: Hypotheses | None = None,
+        *,
+        around: bool = True,
+        everywhere: bool = False,
+    ) -> AlignedPoses:
         """Return where the scan fits, best first.
 
-        `sensor_xy_m`: where the sensor is on the base. `candidates` (k, 3): grid positions around which to look, best
-        first; with `exhaustive` the whole map is searched beside them. Every hypothesis has one pose of its own in the
-        result, as far as it lies on the map.
+        `sensor_xy_m`: where the sensor is on the base. `around` the candidates' places poses are sought, and with
+        `everywhere` on the whole map. Every hypothesis has one pose of its own in the result, as far as it lies on
+        the map. The candidates' own shares of belief count too, wherever the poses come from.
         """
         evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
         if len(evidence) < self.config.min_cells:
             return no_aligned_poses()
         fine = fine_evidence(evidence)
-        found = self._found(evidence, candidates, exhaustive)
+        found = self._found(evidence, candidates.grid if around else np.empty((0, 3)), everywhere)
         followed = self._followed(hypotheses)
         poses = np.vstack([found.poses, followed])
         if not len(poses):
             return no_aligned_poses()
-        reach = np.concatenate([np.full(len(found.poses), 6.0), np.full(len(followed), self.config.follow_m)])
         some = fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
-        climbed, rested = climb(some, self.likelihood, poses, reach_m=float(reach.max()))
+        climbed, rested = climb(some, self.likelihood, poses, reach_m=self.config.follow_m)
         peaks = Peaks(climbed.poses, scores_at(fine, self.likelihood, climbed.poses))
-        source = self._sources(peaks, len(found.poses), candidates, exhaustive)
+        source = self._sources(peaks, len(found.poses), candidates.grid)
         kept = self._kept(peaks, len(found.poses))
         counts = fine.counts()
-        log_likelihood = self.model.log_likelihood(peaks.scores, counts)
-        kept = kept[np.argsort(-peaks.scores[kept], kind="stable")]
+        log_likelihood = self.model.log_likelihood(peaks.scores, counts) + self._retrieved(peaks.poses, candidates)
+        kept = kept[np.argsort(-log_likelihood[kept], kind="stable")]
         chosen = peaks.poses[kept]
         covariance = np.array([self._covariance(some, len(fine), pose) for pose in chosen]).reshape(-1, 3, 3)
         log_odds = log_likelihood[kept] + self.log_prior
         # A hypothesis and a peak of the search may be one pose: it counts once.
-        counted = log_odds.copy()
-        counted[_repeated(chosen)] = -np.inf
-        probabilities = np.exp(counted - np.logaddexp(0.0, logsumexp(counted)))
+        log_odds[_repeated(chosen)] = -np.inf
         return AlignedPoses(
             grid=self._grid(chosen),
-            heading_rad=np.array([wrapped(float(a)) for a in chosen[:, 2]]),
+            heading_rad=np.array([wrapped(float(angle)) for angle in chosen[:, 2]]),
             covariance=covariance,
             log_likelihood=log_likelihood[kept],
-            probabilities=probabilities,
+            probabilities=np.exp(log_odds - np.logaddexp(0.0, logsumexp(log_odds))),
             inliers=np.clip(peaks.scores[kept] / max(float(self.model.expected @ counts), 1e-9), 0.0, 1.0),
             converged=rested[kept],
             source=source[kept],
             log_prior=self.log_prior,
         )
 
-    def _found(self, evidence: Evidence, candidates: Float64Array, exhaustive: bool) -> Peaks:
-        """Return the peaks of the coarse search, brought to the middle level."""
+    def _found(self, evidence: Evidence, places: Float64Array, everywhere: bool) -> Peaks:
+        """Return the best peaks around the places (k, 3) and, where asked, of the whole map, on the middle level."""
         coarse, middle = self.likelihood.levels
-        places = [(float(e), float(n)) for e, n in self._local(candidates[:, :2])] if len(candidates) else []
-        if exhaustive:
+        laid = evidence.coarser(coarse.cell_m, _COARSE_RETURNS, _COARSE_PASSAGES)
+        sought = []
+        if everywhere:
             self.likelihood.prepare()
-            cells = inside(self.likelihood, coarse)
-        else:
-            for easting, northing in candidates[:, :2]:
-                r = self.config.radius_m
-                self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
-            cells = around(self.likelihood, coarse, places, self.config.radius_m)
-        peaks = search_cells(
-            evidence.coarser(coarse.cell_m, _COARSE_RETURNS, _COARSE_PASSAGES), coarse, cells, _COARSE_HEADINGS,
-            self.config.peaks, _APART_M, self._threads if exhaustive else 1,
-        )  # fmt: skip
-        if not len(peaks.scores):
-            return peaks
+            sought.append((inside(self.likelihood, coarse), 2 * self.config.peaks, self._threads))
+        if len(places):
+            self._prepare(places)
+            marked = around(self.likelihood, coarse, self._local(places[:, :2]), self.config.radius_m)
+            sought.append((marked, self.config.peaks, 1))
+        seeds = [
+            search_cells(laid, coarse, cells, _COARSE_HEADINGS, most, _APART_M, threads).poses
+            for cells, most, threads in sought
+        ]
+        if not sum(len(poses) for poses in seeds):
+            return Peaks(np.empty((0, 3)), np.empty(0))
         nearer = local_search(
-            evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES), middle, peaks.poses, 4.0,
+            evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES), middle, np.vstack(seeds), 4.0,
             math.radians(7.5), 2,
         )  # fmt: skip
-        best = merge(nearer, 4.0, _SAME_RAD)[: self.config.poses]
+        best = merge(nearer, 4.0, _SAME_RAD)[: len(sought) * self.config.poses]
         return Peaks(nearer.poses[best], nearer.scores[best])
+
+    def _retrieved(self, poses: Float64Array, candidates: Candidates) -> Float64Array:
+        """Return the log likelihood ratios (p,) that the descriptors give: belief near a pose over that by lot."""
+        if not len(candidates):
+            return np.zeros(len(poses))
+        away = np.hypot(*(poses[:, None, :2] - self._local(candidates.grid[:, :2])[None]).transpose(2, 0, 1))
+        believed = (away <= _PLACE_M) @ candidates.probabilities
+        by_lot = min(math.pi * _PLACE_M**2 / self.area_m2, 1.0)
+        return np.asarray(self.config.descriptor_weight * np.log(believed / by_lot + _UNSEEN))
 
     def _followed(self, hypotheses: Hypotheses | None) -> Float64Array:
         """Return the hypotheses (h, 3) as poses to begin at; those off the map as NaN are left to the climb."""
         if hypotheses is None or not len(hypotheses):
             return np.empty((0, 3))
-        local = self._local(hypotheses.grid[:, :2])
-        r = self.config.radius_m
-        for easting, northing in hypotheses.grid[:, :2]:
-            self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
-        return np.column_stack([local, hypotheses.heading_rad])
+        self._prepare(hypotheses.grid)
+        return np.column_stack([self._local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
 
-    def _sources(self, peaks: Peaks, found: int, candidates: Float64Array, exhaustive: bool) -> Int64Array:
-        """Return where each search began: the nearest candidate, the hypothesis, or everywhere."""
+    def _prepare(self, places: Float64Array) -> None:
+        """Have the map read around places (k, 3)."""
+        r = self.config.radius_m
+        for easting, northing in places[:, :2]:
+            self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
+
+    def _sources(self, peaks: Peaks, found: int, places: Float64Array) -> Int64Array:
+        """Return where each pose comes from: the nearest candidate, the hypothesis, or everywhere."""
         source = np.full(len(peaks.scores), EXHAUSTIVE, np.int64)
-        if len(candidates) and not exhaustive:
-            local = self._local(candidates[:, :2])
-            away = np.hypot(*(peaks.poses[:found, None, :2] - local[None]).transpose(2, 0, 1))
-            source[:found] = away.argmin(axis=1)
+        if len(places):
+            away = np.hypot(*(peaks.poses[:found, None, :2] - self._local(places[:, :2])[None]).transpose(2, 0, 1))
+            near = away.min(axis=1) <= 2.0 * self.config.radius_m
+            source[:found][near] = away.argmin(axis=1)[near]
         source[found:] = -1 - np.arange(len(source) - found)
         return source
 

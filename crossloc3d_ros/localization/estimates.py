@@ -20,6 +20,7 @@ from crossloc3d_ros.types import (
     ScanCounts,
     Timings,
     TrackState,
+    no_candidates,
 )
 
 HEIGHT_STD_M, TILT_STD_RAD = 0.5, math.radians(2.0)
@@ -54,12 +55,7 @@ def no_estimate(
         longitude_deg=float("nan"),
         altitude_m=float("nan"),
         covariance=np.full((3, 3), np.nan),
-        candidates=Candidates(
-            submap_ids=np.empty(0, dtype=np.int64),
-            descriptor_distances=np.empty(0, dtype=np.float32),
-            probabilities=np.empty(0),
-            grid=np.empty((0, 3)),
-        ),
+        candidates=no_candidates(),
         counts=counts or ScanCounts(),
         timings=timings or Timings(),
     )

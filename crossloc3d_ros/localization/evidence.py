@@ -65,13 +65,16 @@ def evidence_of(place: Float32Array, sensor_height_m: float, sensor_xy_m: tuple[
     """Return the evidence of a prepared scan.
 
     `place` (N, 3): x, y from the sensor along the robot's heading, z above the ground, metres, as
-    `clouds.scan.prepare_scan` gives it. `sensor_xy_m`: where the sensor is on the base.
+    `clouds.scan.prepare_scan` gives it. `sensor_xy_m`: where the sensor is on the base. What lies farther from the base
+    than `REACH_M` is left out: around a place, maps are prepared so far.
     """
     half = math.ceil(REACH_M / CELL_M)
     seen = _seen(np.ascontiguousarray(place, np.float32), np.float32(sensor_height_m), LAYERS_M, half, CELL_M)
     channel, row, column = np.nonzero(seen)
-    xy = np.column_stack([column, row]).astype(np.float64)
-    return Evidence((xy + 0.5 - half) * CELL_M + np.asarray(sensor_xy_m), channel.astype(np.int64))
+    cells = np.column_stack([column, row]).astype(np.float64)
+    xy = (cells + 0.5 - half) * CELL_M + np.asarray(sensor_xy_m)
+    near = np.hypot(xy[:, 0], xy[:, 1]) <= REACH_M + CELL_M
+    return Evidence(xy[near], channel[near].astype(np.int64))
 
 
 @njit(cache=True, nogil=True)

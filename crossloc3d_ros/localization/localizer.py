@@ -134,13 +134,13 @@ class Localizer:
         found: Candidates,
         hypotheses: Hypotheses,
     ) -> AlignedPoses:
-        """Align around the hypotheses, and as often as is due around the candidates or everywhere."""
-        around = found.grid[: self.config.alignment.candidates] if self._looks.around(stamp_ns) else np.empty((0, 3))
-        everywhere = aligner.searches_everywhere and self._looks.everywhere(stamp_ns)
+        """Align around the hypotheses, and as often as is due around the candidates and everywhere."""
+        config, looks = self.config.alignment, self._looks
+        around = looks.around(stamp_ns) and config.search != "exhaustive"
+        everywhere = aligner.searches_everywhere and looks.everywhere(stamp_ns)
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        if aligner.searches_everywhere and self.config.alignment.search == "exhaustive":
-            around = np.empty((0, 3))
-        return aligner.align(prepared, sensor_xy, around, hypotheses, exhaustive=everywhere)
+        candidates = _first(found, config.candidates)
+        return aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around, everywhere=everywhere)
 
 
 class Looks:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,7 @@ CLASSES = UNKNOWN + 1
 MARGIN_CELLS = 3
 """So far beyond its edges a raster must be known for the classes inside to be right."""
 _PRIOR = 50.0  # observations that a class starts with
-_STEEPEST = 4.0  # no single cell says more
+_STEEPEST = 4.0  # no single cell says more; the search's 16 bit numbers rest on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,10 @@ def _load(path: Path) -> ObservationModel:
             settings = json.loads(file.metadata()["calibration"])
         if ratios.shape != (CHANNELS, CLASSES) or expected.shape != (CHANNELS,):
             raise ValueError(f"log ratios of shape {ratios.shape}")
+        if not (np.abs(ratios) <= _STEEPEST).all() or not np.isfinite(expected).all():
+            raise ValueError(f"log ratios that are not finite, or beyond {_STEEPEST:g}")
+        if not (float(settings["temperature"]) > 0.0 and math.isfinite(float(settings["expected_share"]))):
+            raise ValueError(f"calibration {settings}")
         return ObservationModel(ratios, expected, float(settings["expected_share"]), float(settings["temperature"]))
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CrossLocError(f"{path} is not an observation model of this version: {error}") from error
@@ -96,14 +101,17 @@ def surface_classes(terrain: Float32Array, surface: Float32Array) -> Int32Array:
 def fit_log_ratios(seen: Float64Array) -> tuple[Float32Array, Float64Array]:
     """Return log ratios (CHANNELS, CLASSES) and their expectation (CHANNELS,) at true poses.
 
-    `seen` (CHANNELS, CLASSES) counts the cells of each channel that fell on each class at true poses.
+    `seen` (CHANNELS, CLASSES) counts the cells of each channel that fell on each class at true poses. A layer from
+    which all beams were returned, or none, tells nothing.
     """
     returns, passages = seen[:LAYERS], seen[LAYERS:]
     share = returns.sum(axis=1, keepdims=True) / np.maximum(seen[:LAYERS] + seen[LAYERS:], 1e-9).sum(
         axis=1, keepdims=True
     )
     p = (returns + _PRIOR * share) / (returns + passages + _PRIOR)
-    ratios = np.concatenate([np.log(p / share), np.log((1.0 - p) / (1.0 - share))])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.concatenate([np.log(p / share), np.log((1.0 - p) / (1.0 - share))])
+    ratios[np.tile((share <= 0.0) | (share >= 1.0), (2, 1))[:, 0]] = 0.0
     ratios[:, UNKNOWN] = 0.0
     ratios = np.clip(ratios, -_STEEPEST, _STEEPEST)
     expected = (seen * ratios).sum(axis=1) / np.maximum(seen.sum(axis=1), 1.0)

@@ -8,7 +8,6 @@ poses at once; what scores best is looked at again on the next level, and at las
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -127,10 +126,8 @@ def wrapped(angle: float) -> float:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
-def around(
-    likelihood: MapLikelihood, level: Level, places: Sequence[tuple[float, float]], radius_m: float
-) -> BoolArray:
-    """Mark the cells (H, W) of a level within `radius_m` of any place (metres from the south-west corner)."""
+def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius_m: float) -> BoolArray:
+    """Mark the cells (H, W) of a level within `radius_m` of any place (k, 2), metres from the south-west corner."""
     marked = np.zeros(level.ratios.shape[1:], np.bool_)
     reach = math.ceil(radius_m / level.cell_m)
     for x, y in places:

@@ -97,6 +97,8 @@ class _Mixture:
     """(n,) average log likelihood of the scans of the present spot."""
     looks: Float64Array
     """(n,) how many scans of the spot that average stands for."""
+    banked: Float64Array
+    """(n,) log likelihood of the spots before, since it was born."""
     followed_m: Float64Array
     """(n,) way over which it explained the scans, since it was born or since the motion was unknown."""
     misfit: Float64Array
@@ -343,23 +345,44 @@ class Tracker:
         evidence = _log_sum(np.concatenate([told, np.full((n, 1), blind)], axis=1), axis=1)
         gained, average, looks = _tempered(evidence, before, news)
         total = before.log_weight + gained
-        unseen = dataclasses.replace(before, log_weight=total + blind - evidence, average=average, looks=looks)
+        banked = before.banked + news * before.average
+        unseen = dataclasses.replace(
+            before, log_weight=total + blind - evidence, average=average, looks=looks, banked=banked
+        )
         h, i = np.nonzero(np.isfinite(told)) if m else (np.empty(0, np.int64), np.empty(0, np.int64))
         seen = dataclasses.replace(
             _corrected(before, poses, fit, h, i, self._moved_m, config),
             log_weight=(total[:, None] + told - evidence[:, None])[h, i],
             average=average[h],
             looks=looks[h],
+            banked=banked[h],
         )
         return (unseen.join(seen), np.concatenate([np.full(n, -1), i])), evidence
 
     def _births(
         self, poses: AlignedPoses, log_open: float, log_prior: float, branches: tuple[_Mixture, Int64Array]
     ) -> _Mixture:
-        """Return the aligned poses that no hypothesis explains as well."""
+        """Return the aligned poses that no hypothesis explains as well.
+
+        A place that is found late has missed the evidence of the spots before: it may be the one where the robot was
+        all the time, and would have fitted there as it does here. So it is granted what the likeliest hypothesis has
+        banked, in proportion to how well it fits, times the belief that the search has missed it all the way.
+        """
         blind = self._config.blind_share
         log_likelihood = np.logaddexp(math.log(blind), math.log1p(-blind) + poses.log_likelihood)
         log_weight = log_open + log_prior + log_likelihood
+        if len(branches[0]):
+            leader = int(np.argmax(branches[0].log_weight))
+            weight, average, banked, followed_m = (
+                float(values[leader])
+                for values in (
+                    branches[0].log_weight, branches[0].average, branches[0].banked, branches[0].followed_m,
+                )
+            )  # fmt: skip
+            if average > 0.0 and banked > 0.0 and math.isfinite(followed_m):
+                granted = banked * (np.clip(log_likelihood / average, 0.0, 1.0) - 1.0)
+                missed = followed_m / self._config.evidence_m * math.log1p(-self._config.found_share)
+                log_weight = np.logaddexp(log_weight, weight + granted + missed + log_likelihood - average)
         explained = np.full(len(poses), -np.inf)
         mixture, corrected_by = branches
         seen = corrected_by >= 0
@@ -652,6 +675,7 @@ def _born(
         log_weight=log_weight,
         average=np.zeros(n) if log_likelihood is None else log_likelihood,
         looks=np.ones(n),
+        banked=np.zeros(n),
         followed_m=np.zeros(n),
         misfit=np.ones(n),
         unrest=np.ones(n),

@@ -25,7 +25,7 @@ from crossloc3d_ros.localization.evidence import CHANNELS, evidence_of
 from crossloc3d_ros.localization.likelihood import MapLikelihood
 from crossloc3d_ros.localization.observation_model import CLASSES, ObservationModel, fit_log_ratios
 from crossloc3d_ros.places.store import AerialMap
-from crossloc3d_ros.types import AlignedPoses, Float64Array
+from crossloc3d_ros.types import AlignedPoses, Float64Array, no_candidates
 
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
 """A pose is right within these."""
@@ -125,7 +125,7 @@ def _answer(aligner: Aligner, scan: RawScan, on_map: bool) -> Answer | None:
     """Seek one scan on the whole map."""
     prepared, T = prepared_of(scan), scan.T_base_lidar
     sensor_xy = float(T[0, 3]), float(T[1, 3])
-    aligned = aligner.align(prepared, sensor_xy, np.empty((0, 3)), exhaustive=True)
+    aligned = aligner.align(prepared, sensor_xy, no_candidates(), everywhere=True)
     if not len(aligned):
         return None
     expected = float(aligner.model.expected @ fine_counts(prepared, sensor_xy))
