@@ -1,0 +1,202 @@
+"""The observation model: classes cell by cell, shares that are known, files that are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS
+from crossloc3d_ros.localization.observation_model import (
+    CLASSES,
+    HEIGHTS_M,
+    MARGIN_CELLS,
+    UNKNOWN,
+    ObservationModel,
+    fit_log_ratios,
+    surface_classes,
+)
+from crossloc3d_ros.types import Float32Array
+
+STEPS = len(HEIGHTS_M) + 1
+
+
+def heights(seed: int, holes: float = 0.1, size: int = 24) -> tuple[Float32Array, Float32Array]:
+    """Return a terrain and a surface with roofs and crowns, and holes in both."""
+    rng = np.random.default_rng(seed)
+    terrain = rng.normal(3.0, 0.1, (size, size))
+    above = np.kron(rng.choice([0.0, 0.8, 4.0, 7.0, 13.0], (size // 4, size // 4)), np.ones((4, 4)))
+    above += rng.exponential(1.5, (size, size)) * (rng.random((size, size)) < 0.3)
+    surface = terrain + above
+    surface[rng.random((size, size)) < holes] = np.nan
+    terrain[rng.random((size, size)) < holes / 4] = np.nan
+    return terrain.astype(np.float32), surface.astype(np.float32)
+
+
+def class_by_hand(above: Float32Array, i: int, j: int) -> int:
+    """Return the class of one cell from its neighbours, edges mirrored as SciPy does."""
+    rows, columns = above.shape
+
+    def at(r: int, c: int) -> float:
+        r, c = (-r - 1 if r < 0 else 2 * rows - 1 - r if r >= rows else r), c
+        c = -c - 1 if c < 0 else 2 * columns - 1 - c if c >= columns else c
+        return float(above[r, c])
+
+    def held(r: int, c: int) -> float:
+        return at(r, c) if math.isfinite(at(r, c)) else 0.0
+
+    if not math.isfinite(above[i, j]):
+        return UNKNOWN
+    around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)]
+    known = [at(*cell) for cell in around if math.isfinite(at(*cell))]
+    bend = 0.0
+    for r, c in around:
+        r, c = min(max(r, -r - 1), 2 * rows - 1 - r), min(max(c, -c - 1), 2 * columns - 1 - c)
+        bend += abs(held(r - 1, c) + held(r + 1, c) + held(r, c - 1) + held(r, c + 1) - 4.0 * held(r, c)) / 9.0
+    here, low, high = (sum(v >= step for step in HEIGHTS_M) for v in (at(i, j), min(known), max(known)))
+    return int(((here * STEPS + low) * STEPS + high) * 2 + (bend > 2.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
+    terrain, surface = heights(seed)
+    classes = surface_classes(terrain, surface)
+    expected = [[class_by_hand(surface - terrain, i, j) for j in range(24)] for i in range(24)]
+    np.testing.assert_array_equal(classes, expected)
+    assert len(np.unique(classes)) > 50
+    assert (classes[np.isnan(surface) | np.isnan(terrain)] == UNKNOWN).all()
+    assert 0 <= classes.min() <= classes.max() < CLASSES
+
+
+def test_a_cell_s_class_depends_on_no_more_than_the_margin() -> None:
+    terrain, surface = heights(5, size=40)
+    part = slice(10, 30)
+    inner = surface_classes(terrain[part, part], surface[part, part])[
+        MARGIN_CELLS:-MARGIN_CELLS, MARGIN_CELLS:-MARGIN_CELLS
+    ]
+    whole = surface_classes(terrain, surface)[part, part]
+    np.testing.assert_array_equal(inner, whole[MARGIN_CELLS:-MARGIN_CELLS, MARGIN_CELLS:-MARGIN_CELLS])
+
+
+def test_of_a_map_without_terrain_nothing_is_known() -> None:
+    terrain, surface = heights(1)
+    assert (surface_classes(np.full_like(terrain, np.nan), surface) == UNKNOWN).all()
+    assert (surface_classes(terrain, np.full_like(surface, np.nan)) == UNKNOWN).all()
+
+
+def test_known_shares_are_recovered() -> None:
+    rng = np.random.default_rng(0)
+    share = rng.uniform(0.05, 0.6, (LAYERS, CLASSES))
+    beams = rng.integers(200_000, 400_000, (LAYERS, CLASSES)).astype(float)
+    seen = np.concatenate([share * beams, (1.0 - share) * beams])
+    ratios, expected = fit_log_ratios(seen)
+    overall = (share * beams).sum(axis=1) / beams.sum(axis=1)
+    known = np.arange(CLASSES) != UNKNOWN
+    p = np.exp(ratios[:LAYERS]) * overall[:, None]
+    np.testing.assert_allclose(p[:, known], share[:, known], rtol=0.02)
+    np.testing.assert_allclose(
+        (1.0 - np.exp(ratios[LAYERS:]) * (1.0 - overall[:, None]))[:, known], share[:, known], rtol=0.02
+    )
+    assert (ratios[:, UNKNOWN] == 0.0).all()
+    assert (expected > 0).all(), "at the true pose every channel speaks for it"
+    np.testing.assert_allclose(expected, (seen * ratios).sum(axis=1) / seen.sum(axis=1))
+
+
+def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> None:
+    seen = np.zeros((CHANNELS, CLASSES))
+    seen[:LAYERS, 0], seen[LAYERS:, 0] = 1e6, 1e6
+    seen[0, 1] = 2.0  # two returns of two beams
+    seen[0, 2] = 1e9
+    seen[LAYERS, 3] = 1e9
+    ratios, _ = fit_log_ratios(seen)
+    assert 0.0 < ratios[0, 1] < 0.05
+    assert np.abs(ratios).max() <= 4.0
+    np.testing.assert_allclose(ratios[:, 4:], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("never", ["a return", "a passage", "anything"])
+def test_a_layer_in_which_nothing_happened_says_nothing(never: str) -> None:
+    seen = np.random.default_rng(0).uniform(1, 100, (CHANNELS, CLASSES))
+    if never in ("a return", "anything"):
+        seen[LAYERS - 1] = 0.0
+    if never in ("a passage", "anything"):
+        seen[CHANNELS - 1] = 0.0
+    ratios, expected = fit_log_ratios(seen)
+    assert np.isfinite(ratios).all()
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(ratios[[LAYERS - 1, CHANNELS - 1]], 0.0, atol=1e-6)
+    assert np.abs(ratios[0]).max() > 0.1
+
+
+def model(seed: int = 0) -> ObservationModel:
+    rng = np.random.default_rng(seed)
+    ratios = rng.uniform(-3, 3, (CHANNELS, CLASSES)).astype(np.float32)
+    return ObservationModel(ratios, rng.uniform(0, 1, CHANNELS), 0.37, 12.5)
+
+
+def test_a_model_comes_back_from_its_file_as_it_was(tmp_path: Path) -> None:
+    made, path = model(), tmp_path / "model.safetensors"
+    made.save(path)
+    read = ObservationModel.load(path)
+    np.testing.assert_array_equal(read.log_ratios, made.log_ratios)
+    np.testing.assert_array_equal(read.expected, made.expected)
+    assert (read.expected_share, read.temperature) == (0.37, 12.5)
+
+
+def test_half_of_the_expected_score_leaves_it_open() -> None:
+    shipped = dataclasses.replace(model(), expected_share=0.5, temperature=4.0)
+    counts = np.arange(CHANNELS) * 10
+    expected = float(shipped.expected @ counts)
+    found = shipped.log_likelihood(np.array([0.0, 0.5, 1.0]) * expected, counts)
+    np.testing.assert_allclose(found, np.array([-0.5, 0.0, 0.5]) * expected / 4.0)
+
+
+def test_the_shipped_model_knows_that_walls_return_beams() -> None:
+    shipped = ObservationModel.load()
+    street, roof = 0, ((4 * STEPS + 4) * STEPS + 4) * 2  # all below 0.4 m; all between 5 and 10 m
+    edge = ((4 * STEPS + 0) * STEPS + 4) * 2 + 1  # and rough: it falls by more than 5 m
+    assert np.isfinite(shipped.log_ratios).all()
+    assert (shipped.log_ratios[: LAYERS - 1, edge] > 0.5).all()
+    assert (shipped.log_ratios[:LAYERS, street] < 0.0).all()
+    assert (shipped.log_ratios[LAYERS : CHANNELS - 1, roof] < -0.5).all(), "beams fly through no house"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ["missing", "empty", "text", "cut", "other shape", "no calibration", "NaN", "too steep", "temperature", "folder"],
+)
+def test_a_file_that_is_no_model_is_named(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / f"{damage}.safetensors"
+    made = model()
+    if damage == "empty":
+        path.touch()
+    elif damage == "text":
+        path.write_text("no model")
+    elif damage == "cut":
+        made.save(path)
+        path.write_bytes(path.read_bytes()[:-1000])
+    elif damage == "other shape":
+        save_file(
+            {"log_ratios": made.log_ratios[:, :-1].copy(), "expected": made.expected}, path, {"calibration": "{}"}
+        )
+    elif damage == "no calibration":
+        save_file({"log_ratios": made.log_ratios, "expected": made.expected}, path)
+    elif damage == "NaN":
+        made.log_ratios[2, 5] = np.nan
+        made.save(path)
+    elif damage == "too steep":
+        made.log_ratios[2, 5] = 50.0
+        made.save(path)
+    elif damage == "temperature":
+        dataclasses.replace(made, temperature=0.0).save(path)
+    elif damage == "folder":
+        path.mkdir()
+    with pytest.raises(CrossLocError, match="is not an observation model of this version") as raised:
+        ObservationModel.load(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
