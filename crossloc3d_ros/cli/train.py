@@ -11,6 +11,7 @@ from rich.console import Console
 
 from crossloc3d_ros.cli import common
 from crossloc3d_ros.config import PlacesConfig, TrainConfig, from_dict
+from crossloc3d_ros.errors import ConfigError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -93,7 +94,25 @@ def _parser() -> argparse.ArgumentParser:
     alignment.add_argument("--output", type=Path, required=True, help="file to write (.safetensors)")
     alignment.set_defaults(action=_alignment)
 
-    for command in (places, run, export, card, curve, alignment):
+    verification = commands.add_parser(
+        "verification", help="fit how much height maps count beside descriptors in `evaluate --verify`"
+    )
+    verification.add_argument(
+        "--places", type=Path, required=True, action="append",
+        help="folder of make-places whose validation towns are asked, may be repeated",
+    )  # fmt: skip
+    verification.add_argument("--weights", type=Path, help="weights to search with (default: the shipped ones)")
+    verification.add_argument(
+        "--candidates", type=int, default=300, help="answers of a query that are compared (default: %(default)s)"
+    )
+    verification.add_argument(
+        "--data", type=Path, default=Path("out/benchmark"),
+        help="folder in which descriptors are kept (default: %(default)s)",
+    )  # fmt: skip
+    verification.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
+    verification.set_defaults(action=_verification)
+
+    for command in (places, run, export, card, curve, alignment, verification):
         common.add_verbosity(command)
     return parser
 
@@ -116,6 +135,35 @@ def _alignment(arguments: argparse.Namespace) -> int:
         f"{arguments.output}: {len(answers)} scans, {found} of them right at once; as likely here as not at "
         f"{model.expected_share:.2f} of the expected score, odds times e for {model.temperature:.1f}"
     )
+    return 0
+
+
+def _verification(arguments: argparse.Namespace) -> int:
+    import functools
+
+    from crossloc3d_ros.encoder.checkpoint import load_encoder
+    from crossloc3d_ros.evaluation.encoding import EncodingJob
+    from crossloc3d_ros.evaluation.verification import VerificationConfig
+    from crossloc3d_ros.training.material import read_material
+    from crossloc3d_ros.training.verification import RADII_M, fit_verification
+
+    if arguments.workers < 1:
+        raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
+    candidates = from_dict(VerificationConfig, {"candidates": arguments.candidates}).candidates
+    threads = 1 if arguments.workers > 1 else None
+    loader = functools.partial(load_encoder, arguments.weights, "cpu", threads)
+    encoder = loader()
+    towns = read_material(arguments.places, encoder.preprocessing).validation_towns(TrainConfig())
+    with common.ProgressDisplay(common.console()) as display:
+        job = EncodingJob(encoder, loader, arguments.data / "descriptors", arguments.workers, display)
+        fitted = fit_verification(towns, job, candidates, arguments.workers)
+    print(f"{fitted.queries:,} queries among {fitted.submaps:,} submaps of {fitted.towns} towns; R@1, each town by the "
+          "weight of the others:")  # fmt: skip
+    for radius, before, after in zip(RADII_M, fitted.retrieval, fitted.verified, strict=True):
+        print(f"  within {radius:3.0f} m: retrieval {100 * before:.1f} %, with height maps {100 * after:.1f} %")
+    low, high = min(fitted.town_weights), max(fitted.town_weights)
+    print(f"weight {fitted.weight:.3g} (without one town {low:.3g} to {high:.3g}): evaluate --verify {candidates} "
+          f"--verify-weight {fitted.weight:.3g}")  # fmt: skip
     return 0
 
 

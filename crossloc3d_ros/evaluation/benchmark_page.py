@@ -52,7 +52,7 @@ def write_page(
         "curve_legend": _curve_legend(scores, main),
         "gallery": _gallery(pictures, main, texts.cloud_width_m),
         "divided": _divided_table(main),
-        "words": _words(main, texts),
+        "words": _words(scores, main, texts),
         "footer": escape(texts.footer),
         "style": _page_file("page.css") + _page_file("benchmark.css"),
     }
@@ -68,14 +68,16 @@ def describe(about: About) -> str:
     if about.query_headings > 1:
         kept = "nearest kept" if about.way == "nearest" else "mean descriptor"
         how = f", {about.query_headings} headings tried, {kept}"
-    return f"{about.setting}, {heading}{how}"
+    again = f", {about.kind} ({about.verified:,})" if about.verified else ""
+    return f"{about.setting}, {heading}{how}{again}"
 
 
 def describe_briefly(about: About) -> str:
     """Return the same for narrow tables."""
     heading = "north" if about.heading == "aligned" else "random"
     tried = f", {about.query_headings} {about.way}" if about.query_headings > 1 else ""
-    return f"{about.setting}, {heading}{tried}"
+    again = f" + {about.verified} maps" if about.verified else ""
+    return f"{about.setting}, {heading}{tried}{again}"
 
 
 def _page_file(name: str) -> str:
@@ -104,8 +106,9 @@ def _tiles(main: Scores) -> str:
         tiles.append((what, percent(figure.share.value), f"{interval(figure)}; by lot {percent(figure.chance)}"))
     about = main.about
     once = "one descriptor" if about.query_headings == 1 else f"{about.query_headings} descriptors"
-    detail = f"encoding {about.encode_ms:.1f} ms ({once}), searching {about.search_ms:.1f} ms; median"
-    tiles.append(("Time a query", f"{about.encode_ms + about.search_ms:.0f} ms", detail))
+    again = f", height maps {about.verify_ms:.1f} ms ({about.verified:,} places)" if about.verified else ""
+    detail = f"encoding {about.encode_ms:.1f} ms ({once}), searching {about.search_ms:.1f} ms{again}; median"
+    tiles.append(("Time a query", f"{about.query_ms:.0f} ms", detail))
     return "".join(
         f'<div class="tile"><span class="what">{escape(what)}</span><span class="value">{value}</span>'
         f'<span class="detail">{escape(detail)}</span></div>'
@@ -121,7 +124,7 @@ def _recall_table(scores: Sequence[Scores], main: Scores, radius_m: float) -> st
         cells = "".join(_cell(each.overall.figure(figure.label, radius_m)) for figure in labels)
         css = ' class="headline"' if each is main else ""
         counted = each.overall.figure("R@1", radius_m).queries
-        note = f"<small>{counted:,} queries, {each.about.database:,} places</small>"
+        note = f"<small>{counted:,} queries, {each.about.database:,} places; by {each.about.kind}</small>"
         rows.append(f"<tr{css}><th scope='row'>{escape(describe(each.about))}{note}</th>{cells}</tr>")
     return (
         f'<div class="scroll"><table class="recall"><caption>An answer counts within {radius_m:g} m</caption>'
@@ -231,7 +234,7 @@ def _divided_row(group: GroupScores, columns: Sequence[tuple[str, float]], css: 
     return f"<tr class='{css}'><th scope='row'>{escape(group.name.replace('_', ' '))}{note}</th>{cells}</tr>"
 
 
-def _words(main: Scores, texts: PageTexts) -> str:
+def _words(scores: Sequence[Scores], main: Scores, texts: PageTexts) -> str:
     one_per_cent = main.overall.figure("R@1%", 100.0).rank
     paragraphs = [
         "<h3>Recall</h3><p>R@N within a radius is the share of queries for which one of the first N answers is centred "
@@ -248,10 +251,25 @@ def _words(main: Scores, texts: PageTexts) -> str:
         "2,000 times; where fewer than eight towns were asked, squares of 50 m stand in for them. The interval holds "
         "95 % of these draws and is widened to hold Wilson's interval for as many trials as there are places at least "
         "25 m apart.</p>",
+        *_verification_words(scores),
         *_heading_words(main),
         *(f"<p>{escape(sentence)}</p>" for sentence in texts.words),
     ]
     return "".join(paragraphs)
+
+
+def _verification_words(scores: Sequence[Scores]) -> list[str]:
+    about = next((each.about for each in scores if each.about.verified), None)
+    if about is None:
+        return []
+    return [
+        f"<h3>Height maps</h3><p>“Retrieval” orders all places by their descriptors. “{escape(about.kind)}” compares "
+        f"the scan's height map with those of the first {about.verified:,} answers, in every heading and at the offset "
+        "that fits best, and orders these anew by both distances; those behind keep their order. The distance of the "
+        "descriptors counts in units of the weights' calibration (its temperature), that of the height maps (square "
+        f"roots of heights, in patch units) with the weight {about.verification_weight:g}, fitted on other towns. "
+        f"It takes {about.verify_ms:.0f} ms a query besides, in one thread.</p>"
+    ]
 
 
 def _heading_words(main: Scores) -> list[str]:

@@ -33,6 +33,7 @@ STORED = 100
 """Answers kept of each query, or as many as one per cent of the database where that is more."""
 _BLOCK = 64
 _LOT_SEED = 20_240_817
+_OF_FITS = ("fits", "fit_headings_rad")
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,28 @@ class About:
     encode_ms: float = 0.0
     """Median to encode one query in all its headings, in one process."""
     search_ms: float = 0.0
+    verified: int = 0
+    """How many first answers of a query were ordered anew by height maps (`verification`); 0: retrieval alone."""
+    verification_weight: float = 0.0
+    verify_ms: float = 0.0
+    """Median to compare one query with that many answers, in one thread."""
 
     @property
     def name(self) -> str:
         """A short name, unique among the predictions of one method and benchmark."""
         way = "" if self.query_headings == 1 else f"_{self.query_headings}-{self.way}"
-        return f"{self.setting.replace('+', '_')}_{self.heading}{way}"
+        again = f"_verified-{self.verified}" if self.verified else ""
+        return f"{self.setting.replace('+', '_')}_{self.heading}{way}{again}"
+
+    @property
+    def kind(self) -> str:
+        """What ordered the answers, for people."""
+        return "retrieval + height maps" if self.verified else "retrieval"
+
+    @property
+    def query_ms(self) -> float:
+        """Time a query takes in all."""
+        return self.encode_ms + self.search_ms + self.verify_ms
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +91,13 @@ class Predictions:
     ids: Int64Array
     """(Q, K) rows of the database: the aerial places, then those of the ground database."""
     distances: Float32Array
-    """(Q, K) between descriptors."""
+    """(Q, K) between descriptors; they ascend unless the answers were verified."""
     headings: Int64Array
     """(Q, K) number of the heading, of `about.query_headings`, in which the query lay nearest."""
+    fits: Float32Array | None = None
+    """(Q, K) between height maps, NaN for answers that were not verified; None where none was."""
+    fit_headings_rad: Float32Array | None = None
+    """(Q, K) in which heading the height maps fitted best, counter-clockwise from how the query was given."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +110,8 @@ class Plan:
     """Compared in the heading mode "random"; an aligned query needs no other heading."""
     invariant: bool = True
     """Whether descriptors are meant to be the same in every heading, so that their mean makes sense."""
+    kept: int = STORED
+    """Answers kept of each query at least, as far as the database has them."""
 
     def __post_init__(self) -> None:
         """Refuse a plan without anything to do."""
@@ -167,7 +190,7 @@ def predict_all(evaluation_set: EvaluationSet, job: EncodingJob, plan: Plan, wei
     timed: dict[int, tuple[float, float]] = {}
     for setting in plan.settings:
         database = np.concatenate(encoded if setting == "aerial+ground" else encoded[:1])[:, 0]
-        top = min(len(database), max(STORED, one_per_cent(len(database))))
+        top = min(len(database), max(STORED, plan.kept, one_per_cent(len(database))))
         index = DescriptorMap(database) if own is None else None
         for mode, count, way, descriptors in ways:
             if count not in timed:
@@ -258,6 +281,7 @@ def save_predictions(path: Path, predictions: Predictions) -> None:
         ids=predictions.ids.astype(np.int32),
         distances=predictions.distances,
         headings=predictions.headings.astype(np.int16),
+        **{name: values for name in _OF_FITS if (values := getattr(predictions, name)) is not None},
     )
     partial = path.with_name(f".{path.name}.partial")
     try:
@@ -276,13 +300,28 @@ def load_predictions(path: Path) -> Predictions:
         with np.load(path, allow_pickle=False) as file:
             about = from_dict(About, json.loads(file["about"].tobytes()))
             ids, distances, headings = (file[name] for name in ("ids", "distances", "headings"))
+            fits = {name: file[name].astype(np.float32) for name in _OF_FITS if about.verified}
     except FileNotFoundError as error:
         raise EvaluationError(f"no such predictions: {path}") from error
     except (OSError, ValueError, KeyError, EOFError, ConfigError, zipfile.BadZipFile) as error:
         raise EvaluationError(f"the predictions {path} are damaged ({error}); make them again") from error
-    if not (ids.ndim == 2 and ids.shape == distances.shape == headings.shape):
+    columns = (ids, distances, headings, *fits.values())
+    if ids.ndim != 2 or any(column.shape != ids.shape for column in columns):
         raise EvaluationError(f"the predictions {path} are damaged; make them again")
-    return Predictions(about, ids.astype(np.int64), distances.astype(np.float32), headings.astype(np.int64))
+    return Predictions(about, ids.astype(np.int64), distances.astype(np.float32), headings.astype(np.int64), **fits)
+
+
+def check_answers(predictions: Predictions, evaluation_set: EvaluationSet) -> None:
+    """Raise EvaluationError where predictions and set do not belong together."""
+    about, database = predictions.about, database_of(evaluation_set, predictions.about.setting)
+    if about.data != evaluation_set.fingerprint():
+        raise EvaluationError(
+            f"the predictions '{about.name}' were made of another set than '{evaluation_set.name}' as it is here "
+            f"({about.data}, this is {evaluation_set.fingerprint()}): predict again"
+        )
+    ids = predictions.ids
+    if len(ids) != len(evaluation_set.queries) or (ids.size and not (ids.min() >= 0 and ids.max() < len(database))):
+        raise EvaluationError(f"the predictions '{about.name}' name places that the set does not have: predict again")
 
 
 def metres_of(predictions: Predictions, evaluation_set: EvaluationSet) -> Float64Array:
@@ -290,16 +329,9 @@ def metres_of(predictions: Predictions, evaluation_set: EvaluationSet) -> Float6
 
     Raises EvaluationError where predictions and set do not belong together.
     """
-    about, queries = predictions.about, evaluation_set.queries
-    database = database_of(evaluation_set, about.setting)
-    if about.data != evaluation_set.fingerprint():
-        raise EvaluationError(
-            f"the predictions '{about.name}' were made of another set than '{evaluation_set.name}' as it is here "
-            f"({about.data}, this is {evaluation_set.fingerprint()}): predict again"
-        )
+    check_answers(predictions, evaluation_set)
+    queries, database = evaluation_set.queries, database_of(evaluation_set, predictions.about.setting)
     ids = predictions.ids
-    if len(ids) != len(queries) or (ids.size and not (ids.min() >= 0 and ids.max() < len(database))):
-        raise EvaluationError(f"the predictions '{about.name}' name places that the set does not have: predict again")
     offsets = database.xy_m[ids] - queries.xy_m[:, None]
     metres = np.hypot(offsets[..., 0], offsets[..., 1])
     metres[database.area[ids] != queries.area[:, None]] = np.inf

@@ -14,8 +14,8 @@ from crossloc3d_ros.evaluation.predictions import Way
 from crossloc3d_ros.evaluation.scores import PUBLISHED_ONE_PER_CENT, Figure, Scores
 
 _COLUMNS = (
-    "benchmark", "weights", "setting", "heading", "query_headings", "way", "divided_by", "name", "queries", "areas",
-    "measure", "rank", "radius_m", "counted", "recall", "low", "high", "chance",
+    "benchmark", "weights", "setting", "heading", "query_headings", "way", "kind", "verified", "divided_by", "name",
+    "queries", "areas", "measure", "rank", "radius_m", "counted", "recall", "low", "high", "chance",
 )  # fmt: skip
 
 
@@ -27,10 +27,11 @@ def label_of(figure: Figure) -> str:
 def headline(scores: Sequence[Scores], query_headings: int, way: Way) -> Scores:
     """Return the scores that stand for the method: aerial, random heading, queries tried as the localizer does it.
 
-    Where that was not asked for, aerial and aligned, or the first.
+    Where that was not asked for, aerial and aligned, or the first. Verified answers where there are any.
     """
+    verified_first = sorted(scores, key=lambda each: -each.about.verified)
     for wanted in (("aerial", "random"), ("aerial", "aligned")):
-        for each in scores:
+        for each in verified_first:
             about = each.about
             tried = (1, "nearest") if about.heading == "aligned" else (query_headings, way)
             if (about.setting, about.heading) == wanted and (about.query_headings, about.way) == tried:
@@ -81,6 +82,8 @@ def _rows(scores: Scores) -> Iterator[dict[str, Any]]:
                     "heading": about.heading,
                     "query_headings": about.query_headings,
                     "way": about.way,
+                    "kind": about.kind,
+                    "verified": about.verified,
                     "divided_by": divided_by,
                     "name": group.name,
                     "queries": group.queries,

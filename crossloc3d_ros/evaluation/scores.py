@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from crossloc3d_ros.clouds.height_map import HeightMapConfig
 from crossloc3d_ros.evaluation.predictions import (
     About,
     Predictions,
@@ -114,7 +115,7 @@ class Scores:
     first_m: Float64Array
     """(Q,) metres from each query to its first answer, infinite in another area."""
     heading: HeadingErrors | None = None
-    """None where a query was not tried in several headings, or none was found."""
+    """None where a query was tried in one heading alone, or none was found."""
 
     def tables(self) -> Mapping[str, Sequence[GroupScores]]:
         """Return the groups of figures by what they are divided by."""
@@ -151,14 +152,18 @@ def score(predictions: Predictions, evaluation_set: EvaluationSet) -> Scores:
 
 def _heading_errors(predictions: Predictions, queries: PlaceSet, found: BoolArray) -> HeadingErrors | None:
     about = predictions.about
-    if about.heading != "random" or about.way != "nearest" or about.query_headings == 1:
+    if about.heading != "random":
+        return None
+    if predictions.fit_headings_rad is not None:
+        tried, step_deg = predictions.fit_headings_rad[:, 0].astype(np.float64), 360.0 / HeightMapConfig().sectors
+    elif about.way == "nearest" and about.query_headings > 1:
+        tried, step_deg = heading_angles(about.query_headings)[predictions.headings[:, 0]], 360.0 / about.query_headings
+    else:
         return None
     driven = found & (driven_angles(queries)[:, 0] == 0.0)  # of the others the heading is not known
     if not driven.any():
         return None
-    tried = heading_angles(about.query_headings)[predictions.headings[driven, 0]]
-    apart = np.degrees(np.abs(np.angle(np.exp(1j * (tried - queries.heading_rad[driven])))))
-    step_deg = 360.0 / about.query_headings
+    apart = np.degrees(np.abs(np.angle(np.exp(1j * (tried - queries.heading_rad)[driven]))))
     return HeadingErrors(int(driven.sum()), step_deg, float(np.median(apart)), float(np.mean(apart <= step_deg)))
 
 

@@ -134,6 +134,8 @@ def _benchmarks(results: Sequence[dict[str, Any]]) -> str:
         how = {"nearest": "nearest kept", "mean": "mean descriptor"}[about["way"]]
         heading = "north-aligned" if about["heading"] == "aligned" else "random"
         heading += f", {tried} tried, {how}" if tried > 1 else ""
+        if verified := about.get("verified"):
+            heading += f"; first {verified:,} ordered by height maps too"
         cells = [_percent(figures[measure]) for measure in _MEASURES]
         lot = f"{100 * figures['R@1', 100.0]['chance']:.1f} %"
         lines.append(
