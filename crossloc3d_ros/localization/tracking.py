@@ -371,22 +371,19 @@ class Tracker:
         blind = self._config.blind_share
         log_likelihood = np.logaddexp(math.log(blind), math.log1p(-blind) + poses.log_likelihood)
         log_weight = log_open + log_prior + log_likelihood
-        if len(branches[0]):
-            leader = int(np.argmax(branches[0].log_weight))
-            weight, average, banked, followed_m = (
-                float(values[leader])
-                for values in (
-                    branches[0].log_weight, branches[0].average, branches[0].banked, branches[0].followed_m,
-                )
-            )  # fmt: skip
-            if average > 0.0 and banked > 0.0 and math.isfinite(followed_m):
-                granted = banked * (np.clip(log_likelihood / average, 0.0, 1.0) - 1.0)
-                missed = followed_m / self._config.evidence_m * math.log1p(-self._config.found_share)
-                log_weight = np.logaddexp(log_weight, weight + granted + missed + log_likelihood - average)
-        explained = np.full(len(poses), -np.inf)
         mixture, corrected_by = branches
+        explained = np.full(len(poses), -np.inf)
         seen = corrected_by >= 0
         np.maximum.at(explained, corrected_by[seen], mixture.log_weight[seen])
+        if len(mixture):
+            leader = int(np.argmax(mixture.log_weight))
+            average, banked = float(mixture.average[leader]), float(mixture.banked[leader])
+            followed_m = float(mixture.followed_m[leader])
+            if average > 0.0 and banked > 0.0 and math.isfinite(followed_m):
+                short = banked * (np.clip(log_likelihood / average, 0.0, 1.0) - 1.0) + log_likelihood - average
+                missed = followed_m / self._config.evidence_m * math.log1p(-self._config.found_share)
+                late = float(mixture.log_weight[leader]) + short + missed
+                log_weight = np.where(np.isneginf(explained), np.logaddexp(log_weight, late), log_weight)
         rows = np.flatnonzero(log_weight > explained)
         return _born(
             poses.grid[rows], poses.heading_rad[rows], poses.covariance[rows], log_weight[rows],

@@ -388,6 +388,20 @@ def test_places_that_look_the_same_are_not_told_apart_by_hope() -> None:
         assert not wrong_fixes(later)
 
 
+def test_a_place_that_the_search_missed_at_first_is_granted_what_it_would_have_told() -> None:
+    tracker = Tracker(CONFIG)
+    here, missed = np.array([0.0, 0.0, 0.0]), np.array([500.0, 80.0, 2.0])
+    for k in range(31):
+        tracker.predict(k * SECOND, Motion(AHEAD, motion_covariance(1.0, 0.0, CONFIG)))
+        poses = [here, missed] if k >= 15 else [here]
+        belief = tracker.update(aligned_at(poses, [8.0] * len(poses)))
+        here, missed = compose(here, AHEAD), compose(missed, AHEAD)
+    # It fits as well since it was found: only that it was missed for 15 m speaks against it.
+    odds = belief.hypotheses.probabilities[1] / belief.hypotheses.probabilities[0]
+    assert odds == pytest.approx((1 - CONFIG.found_share) ** (15 / CONFIG.evidence_m), rel=0.5)
+    assert not belief.is_fix
+
+
 def test_a_robot_that_is_carried_away_is_found_again() -> None:
     ways = []
     for seed in range(3):
