@@ -171,9 +171,9 @@ class Aligner:
         return np.column_stack([self._local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
 
     def _prepare(self, places: Float64Array) -> None:
-        """Have the map read around places (k, 3)."""
+        """Have the map read around places (k, 3); those that are not finite are none."""
         r = self.config.radius_m
-        for easting, northing in places[:, :2]:
+        for easting, northing in places[np.isfinite(places[:, :2]).all(axis=1), :2]:
             self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
 
     def _sources(self, peaks: Peaks, found: int, places: Float64Array) -> Int64Array:
@@ -181,6 +181,7 @@ class Aligner:
         source = np.full(len(peaks.scores), EXHAUSTIVE, np.int64)
         if len(places):
             away = np.hypot(*(peaks.poses[:found, None, :2] - self._local(places[:, :2])[None]).transpose(2, 0, 1))
+            away[np.isnan(away)] = np.inf
             near = away.min(axis=1) <= 2.0 * self.config.radius_m
             source[:found][near] = away.argmin(axis=1)[near]
         source[found:] = -1 - np.arange(len(source) - found)

@@ -76,10 +76,10 @@ class MapLikelihood:
 
     def terrain_height(self, easting: float, northing: float) -> float:
         """Return the height of the terrain in the cell that holds a place, metres; NaN where it is not known."""
-        row, column = int(northing - self.south_m), int(easting - self.west_m)
-        if not (0 <= row < self._terrain.shape[0] and 0 <= column < self._terrain.shape[1]):
+        y, x = northing - self.south_m, easting - self.west_m
+        if not (0.0 <= y < self._terrain.shape[0] and 0.0 <= x < self._terrain.shape[1]):
             return math.nan
-        return float(self._terrain[row, column])
+        return float(self._terrain[int(y), int(x)])
 
     def _tiles(self, low_m: float, high_m: float, axis: int) -> slice:
         count = self._filled.shape[axis]

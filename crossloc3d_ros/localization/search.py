@@ -50,11 +50,12 @@ def search_cells(
         best, heading = _correlate(level.ratios, xy, channel, level.cell_m, angles[which], runs, LAYERS)
         return best, which[heading].astype(np.int16)
 
-    parts = [np.arange(first, headings, threads) for first in range(threads)]
-    if threads == 1:
+    # In order, so that the first of several best headings is taken, by however many threads.
+    parts = np.array_split(np.arange(headings), min(threads, headings))
+    if len(parts) == 1:
         results = [part(parts[0])]
     else:
-        with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(len(parts)) as pool:
             results = list(pool.map(part, parts))
     best, heading = results[0]
     for other, its_heading in results[1:]:
@@ -130,7 +131,7 @@ def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius
     """Mark the cells (H, W) of a level within `radius_m` of any place (k, 2), metres from the south-west corner."""
     marked = np.zeros(level.ratios.shape[1:], np.bool_)
     reach = math.ceil(radius_m / level.cell_m)
-    for x, y in places:
+    for x, y in places[np.isfinite(places).all(axis=1)]:
         row, column = int(y / level.cell_m), int(x / level.cell_m)
         low_r, low_c = max(row - reach, 0), max(column - reach, 0)
         window = marked[low_r : row + reach + 1, low_c : column + reach + 1]
