@@ -83,6 +83,8 @@ class ScanConfig:
     body_max_m: tuple[float, float, float] = option(
         (0.6, 0.5, 2.0), "upper corner; equal = no body", low=-50.0, high=50.0
     )
+    turn_s: float = option(0.1, "time of one turn of the lidar", low=0.0, high=10.0)
+    stamped_at: float = option(1.0, "what the stamp tells: 0 = the turn's start, 1 = its end", low=0.0, high=1.0)
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
 
     def __post_init__(self) -> None:
@@ -123,8 +125,9 @@ class AlignmentConfig:
         "auto",
         "poses are sought around candidates, everywhere, or both where the map is small; or not at all",
     )
-    exhaustive_km2: float = option(1.0, "how large a small map may be", low=0.0, high=1e6)
-    exhaustive_every_s: float = option(2.0, "the whole map is searched no more often", low=0.0, high=1e6)
+    exhaustive_km2: float = option(6.0, "largest map that auto searches as a whole", low=0.0, high=1e6)
+    exhaustive_every_s: float = option(3.0, "the whole map is searched no more often", low=0.0, high=1e6)
+    convincing: float = option(0.9, "auto does not where a pose at a candidate is believed so", low=0.0, high=1.0)
     look_every_s: float = option(1.0, "and while localized, the candidates no more often", low=0.0, high=1e6)
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
@@ -142,7 +145,7 @@ class FusionConfig:
     """From the aligned poses of scan after scan, and odometry, to one pose that may be driven by."""
 
     min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
-    confirm_m: float = option(5.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
+    confirm_m: float = option(10.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
     max_hypotheses: int = option(10, "poses carried along at most", low=1, high=1000)
     evidence_m: float = option(15.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
     evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
@@ -160,7 +163,7 @@ class FusionConfig:
     error_m: float = option(15.0, "way over which that common error changes", low=0.1, high=1000.0)
     position_floor_m: float = option(0.2, "least standard deviation of an aligned pose", low=0.01, high=10.0)
     heading_floor_deg: float = option(0.4, "the same of its heading", low=0.01, high=10.0)
-    map_error_m: float = option(0.1, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
+    map_error_m: float = option(0.2, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
     map_turn_deg: float = option(0.2, "the same of every heading", low=0.0, high=10.0)
     odometry_error: float = option(0.05, "of odometry, one sigma, share of the way and of the turn", low=1e-4, high=1.0)
     odometry_turn_deg_per_m: float = option(0.3, "what it turns too much or too little a metre", low=0.0, high=45.0)

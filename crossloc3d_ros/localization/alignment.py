@@ -7,6 +7,7 @@ shape a covariance.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 
@@ -70,9 +71,13 @@ class Aligner:
 
     @property
     def searches_everywhere(self) -> bool:
-        """Whether the whole map is searched: told to, or left the choice and the map is small."""
+        """Whether the whole map is searched at times: told to, or left the choice and the map is not too large."""
         small = self.area_m2 <= 1e6 * self.config.exhaustive_km2
         return self.config.search == "exhaustive" or (self.config.search == "auto" and small)
+
+    def is_convincing(self, aligned: AlignedPoses) -> bool:
+        """Whether a pose is believed enough to leave the rest of the map alone."""
+        return bool(len(aligned)) and float(aligned.probabilities.max()) >= self.config.convincing
 
     def warm_up(self) -> None:
         """Read what an exhaustive search needs, so that the first scan does not wait for it."""
@@ -91,7 +96,7 @@ class Aligner:
     ) -> AlignedPoses:
         """Return where the scan fits, best first.
 
-        `sensor_xy_m`: where the sensor is on the base. `around` the candidates' places poses are sought, and with
+        `sensor_xy_m`: where the sensor is on the base. `around` the candidates' places poses are sought, with
         `everywhere` on the whole map. Every hypothesis has one pose of its own in the result, as far as it lies on
         the map. The candidates' own shares of belief count too, wherever the poses come from.
         """
@@ -222,6 +227,16 @@ def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int
 def fine_evidence(evidence: Evidence) -> Evidence:
     """Return as much of the evidence as poses are compared by at the end."""
     return evidence.some(_FINE_RETURNS, _FINE_PASSAGES)
+
+
+def moved(aligned: AlignedPoses, step: Float64Array) -> AlignedPoses:
+    """Return the poses moved by `step` (3,): forward, left in metres and a turn in radians."""
+    c, s = np.cos(aligned.heading_rad), np.sin(aligned.heading_rad)
+    grid = aligned.grid.copy()
+    grid[:, 0] += c * step[0] - s * step[1]
+    grid[:, 1] += s * step[0] + c * step[1]
+    heading = np.array([wrapped(float(angle)) for angle in aligned.heading_rad + step[2]])
+    return dataclasses.replace(aligned, grid=grid, heading_rad=heading)
 
 
 def _repeated(poses: Float64Array) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import LocalizerConfig
-from crossloc3d_ros.localization.alignment import Aligner
+from crossloc3d_ros.localization.alignment import Aligner, moved
 from crossloc3d_ros.localization.credibility import effective_calibration, judge
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
 from crossloc3d_ros.localization.odometry import Motion
@@ -76,8 +76,10 @@ class Localizer:
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
+        step = self._within_turn(scan.stamp_ns, motion)
         hypotheses = self._tracker.predict(scan.stamp_ns, motion)
         aligned = self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses)
+        aligned = moved(aligned, step)
         watch.lap("align_ms")
         belief = self._tracker.update(aligned)
         self._looks.state = belief.state
@@ -136,11 +138,23 @@ class Localizer:
     ) -> AlignedPoses:
         """Align around the hypotheses, and as often as is due around the candidates and everywhere."""
         config, looks = self.config.alignment, self._looks
-        around = looks.around(stamp_ns) and config.search != "exhaustive"
-        everywhere = aligner.searches_everywhere and looks.everywhere(stamp_ns)
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
         candidates = _first(found, config.candidates)
-        return aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around, everywhere=everywhere)
+        around = looks.around(stamp_ns) and config.search != "exhaustive"
+        aligned = aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around)
+        if not aligner.searches_everywhere or (config.search == "auto" and aligner.is_convincing(aligned)):
+            return aligned
+        if not looks.everywhere(stamp_ns):
+            return aligned
+        return aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around, everywhere=True)
+
+    def _within_turn(self, stamp_ns: int, motion: Motion | None) -> Float64Array:
+        """Return the way (3,) from the middle of the lidar's turn, of which the scan tells, to its stamp."""
+        since = self._tracker.stamp_ns
+        if motion is None or not motion.is_known or since is None or stamp_ns <= since:
+            return np.zeros(3)
+        seconds = (self.config.scan.stamped_at - 0.5) * self.config.scan.turn_s
+        return np.asarray(motion.delta * (seconds / ((stamp_ns - since) * 1e-9)))
 
 
 class Looks:
