@@ -102,7 +102,7 @@ def posed_estimate(
             placed, status=FixStatus.NO_FIX, reason=belief.reason, state=belief.state, probability=belief.probability,
             aligned=aligned, hypotheses=belief.hypotheses,
         )  # fmt: skip
-    height = belief.grid[2] if math.isfinite(belief.grid[2]) else float(place.enu[2])
+    height = belief.grid[2] if math.isfinite(belief.grid[2]) else float(frame.from_enu(place.enu[None])[0, 2])
     grid = np.array([belief.grid[0], belief.grid[1], height])
     enu = frame.to_enu(grid[None])[0]
     latitude, longitude, altitude = frame.to_geographic(grid[None])
