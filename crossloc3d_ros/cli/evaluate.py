@@ -410,7 +410,7 @@ def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
         notes.append("8 nearest: tried in 8 headings, the nearest kept; 8 mean: by the mean of their descriptors")
     again = max(each.about.verified for each in scores)
     if again:
-        notes.append(f"{again} maps: retrieval + height maps, that many answers ordered by both; others: retrieval")
+        notes.append(f"+ {again} height maps: so many answers ordered by retrieval + height maps; else by retrieval")
     shown[-1].caption = "\n".join(notes)
     divided = _table(
         f"{describe(main_scores.about)}, %", ["", "queries", *(f"R@1 {r:g} m" for r in RADII_M), "R@25 100 m"]

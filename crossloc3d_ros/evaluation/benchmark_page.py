@@ -73,11 +73,12 @@ def describe(about: About) -> str:
 
 
 def describe_briefly(about: About) -> str:
-    """Return the same for narrow tables."""
+    """Return the same for narrow tables, in which verified answers follow those that they are made of."""
+    if about.verified:
+        return f"  + {about.verified} height maps"
     heading = "north" if about.heading == "aligned" else "random"
     tried = f", {about.query_headings} {about.way}" if about.query_headings > 1 else ""
-    again = f" + {about.verified} maps" if about.verified else ""
-    return f"{about.setting}, {heading}{tried}{again}"
+    return f"{about.setting}, {heading}{tried}"
 
 
 def _page_file(name: str) -> str:

@@ -44,7 +44,7 @@ class VerificationConfig:
     """How many answers are looked at again, and how far each distance counts."""
 
     candidates: int = option(300, "first answers of a query that are compared by height maps", low=1, high=100_000)
-    weight: float = option(294.0, "of the height maps' distance; the descriptors' counts once", low=0.0, high=1e6)
+    weight: float = option(293.0, "of the height maps' distance; the descriptors' counts once", low=0.0, high=1e6)
 
 
 class Fits(NamedTuple):

@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from crossloc3d_ros.cli import evaluate
-from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.config import BuildConfig, CalibrationConfig
 from crossloc3d_ros.evaluation import benchmark as benchmarks
 from crossloc3d_ros.evaluation import pose_drives, pose_sets
 from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
 from crossloc3d_ros.evaluation.pose_drives import DrivePlan
 from crossloc3d_ros.evaluation.pose_sets import SimulatedPoses
-from crossloc3d_ros.evaluation.predictions import load_predictions
+from crossloc3d_ros.evaluation.predictions import load_predictions, save_predictions
 from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS, write_cloud
 from crossloc3d_ros.simulation.survey import SurveyConfig
@@ -104,6 +106,73 @@ def test_scan_context_takes_the_place_of_weights(evaluated: tuple[Path, list[str
     assert evaluate.main([*arguments, "--setting", "aerial", "--output", str(tmp_path / "out")]) == 0
     (content,) = json.loads((tmp_path / "out" / "results.json").read_text())
     assert content["about"]["weights"] == "Scan Context"
+
+
+@pytest.fixture(scope="module")
+def calibrated(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the same weights with a calibration."""
+    path = tmp_path_factory.mktemp("calibrated") / "tiny.safetensors"
+    with safe_open(weights, framework="numpy") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = file.metadata()
+    save_file(tensors, path, metadata | {"credibility": json.dumps(dataclasses.asdict(CalibrationConfig(1.0)))})
+    return path
+
+
+def test_height_maps_order_the_answers_anew(
+    evaluated: tuple[Path, list[str]], calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("COLUMNS", "80")
+    arguments = [*evaluated[1], "--weights", str(calibrated), "--setting", "aerial", "--output", str(tmp_path / "out")]
+    arguments = [*arguments, "--query-headings", "1"]
+    assert evaluate.main([*arguments, "--verify", "20"]) == 0
+    shown = capsys.readouterr().out
+    assert "  + 20 height maps" in shown
+    assert "retrieval + height maps" in shown
+    assert all(len(line) <= 80 for line in shown.splitlines() if "/" not in line)
+    folder = tmp_path / "out" / "predictions"
+    kinds = {path.stem: load_predictions(path).about.kind for path in folder.iterdir()}
+    assert kinds == {
+        "aerial_aligned": "retrieval", "aerial_aligned_verified-20": "retrieval + height maps",
+        "aerial_random": "retrieval", "aerial_random_verified-20": "retrieval + height maps",
+    }  # fmt: skip
+    rows = list(csv.DictReader((tmp_path / "out" / "results.csv").open()))
+    assert {(row["kind"], row["verified"]) for row in rows} == {("retrieval", "0"), ("retrieval + height maps", "20")}
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "by retrieval + height maps" in page
+    assert "by retrieval<" in page
+    # Stored answers can be verified later, otherwise, and scored as they lie.
+    monkeypatch.setattr(evaluate, "predict_all", lambda *_: pytest.fail("nothing must be predicted"))
+    assert evaluate.main([*arguments, "--only-score", "--verify", "10", "--verify-weight", "100"]) == 0
+    assert {path.stem for path in folder.iterdir()} == {
+        "aerial_aligned", "aerial_aligned_verified-10", "aerial_random", "aerial_random_verified-10",
+    }  # fmt: skip
+    assert evaluate.main([*arguments, "--only-score"]) == 0
+    content = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [each["about"]["verified"] for each in content] == [0, 10, 0, 10]
+    assert content[1]["about"]["verification_weight"] == 100.0
+
+
+def test_answers_that_height_maps_cannot_order_are_one_clear_line(
+    evaluated: tuple[Path, list[str]], calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(evaluated[0], tmp_path / "out")
+    arguments = [*evaluated[1], "--output", str(tmp_path / "out"), "--only-score", "--verify", "20"]
+    assert "without a calibration" in fails(arguments, capsys)
+    arguments += ["--weights", str(calibrated)]
+    assert "'candidates'" in fails([*arguments, "--verify", "-1"], capsys)
+    assert "'weight'" in fails([*arguments, "--verify-weight", "-1"], capsys)
+    assert "--protocol place" in fails(["--protocol", "pose", "--verify", "20"], capsys)
+    stored = tmp_path / "out" / "predictions" / "aerial_random.npz"
+    made = load_predictions(stored)
+    save_predictions(
+        stored, dataclasses.replace(made, about=dataclasses.replace(made.about, encoder="0123456789abcdef"))
+    )
+    assert "predict again" in fails(arguments, capsys)
+    for path in stored.parent.glob("aerial_[ar]*.npz"):
+        path.unlink()
+    assert "--setting aerial" in fails(arguments, capsys)
 
 
 def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
