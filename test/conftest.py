@@ -190,3 +190,51 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
         truths.append(np.column_stack([places[:, :2], np.full(len(times), heading), times]))
         bags.append(path)
     return RecordedArea(folder / "strip.laz", (bags[0], bags[1]), crs, west, south, (truths[0], truths[1]), start_ns)
+
+
+class HeightHistogram:
+    """Stands in for the network: how many points lie how far from the centre and how high, from whatever heading."""
+
+    fingerprint = "height-histogram"
+    descriptor_size = 80
+
+    def __init__(self) -> None:
+        from crossloc3d_ros.config import CalibrationConfig, PreprocessingConfig
+
+        self.preprocessing = PreprocessingConfig()
+        self.calibration = CalibrationConfig(temperature=0.01, none_distance=0.2, none_scale=0.02)
+
+    def encode(self, points: np.ndarray) -> np.ndarray:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        counts, _, _ = np.histogram2d(radius, points[:, 2], bins=(10, 8), range=((0, 1.0), (0, 0.8)))
+        return (counts.ravel() / max(counts.sum(), 1)).astype(np.float32)
+
+    def encode_batch(self, clouds: list[np.ndarray]) -> np.ndarray:
+        return np.stack([self.encode(cloud) for cloud in clouds])
+
+    def warm_up(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="session")
+def simulated_town(tmp_path_factory: pytest.TempPathFactory) -> object:
+    """Simulate a town, fly over it, map it, and scan it four years later; three scans are from another town.
+
+    Returns the pose set and the encoder of its map.
+    """
+    from crossloc3d_ros.config import BuildConfig
+    from crossloc3d_ros.evaluation.pose_sets import SimulatedPoses, make_pose_set
+    from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
+    from crossloc3d_ros.simulation.survey import SurveyConfig
+
+    poses = SimulatedPoses(
+        SimulatedBenchmark(
+            (BenchmarkTown("estate", 990_112, False),), town_size_m=300.0, queries=7, ground=0,
+            flight=SurveyConfig(spacing_m=0.8), build=BuildConfig(spacing_m=30.0),
+        ),
+        columns=1,
+        off_map=(BenchmarkTown("suburb", 990_113, False),),
+        off_map_scans=3,
+    )  # fmt: skip
+    encoder = HeightHistogram()
+    return make_pose_set("town", poses, tmp_path_factory.mktemp("simulated_town"), lambda: encoder), encoder

@@ -1,9 +1,11 @@
-"""The facade: with an encoder that needs no training, on a map of a few made-up places."""
+"""The facade: with an encoder that needs no training, on a map of a few made-up places and in a simulated town."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +20,15 @@ from crossloc3d_ros.config import (
     LocalizerConfig,
     PreprocessingConfig,
 )
+from crossloc3d_ros.evaluation.pose_sets import PoseSet
+from crossloc3d_ros.evaluation.raw_scans import RawScan
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.localizer import Localizer
+from crossloc3d_ros.localization.localizer import Localizer, Looks
+from crossloc3d_ros.localization.odometry import Motion
+from crossloc3d_ros.localization.search import wrapped
 from crossloc3d_ros.places.descriptor_map import DescriptorMap
 from crossloc3d_ros.places.store import AerialMap, BuildCounts, Manifest, SubmapTable
-from crossloc3d_ros.types import Estimate, FixStatus, Scan
+from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 
 Float32 = npt.NDArray[np.float32]
 ORIGIN = np.array([628_500.0, 5_804_000.0, 2.0])
@@ -171,3 +177,150 @@ def test_warm_up_leaves_nothing_behind(aerial_map: AerialMap) -> None:
     cold, warm = (Localizer(aerial_map, HistogramEncoder(), LocalizerConfig(alignment=BY_PLACE)) for _ in range(2))
     warm.warm_up()
     np.testing.assert_array_equal(cold.localize(scan_of_place(2)).grid, warm.localize(scan_of_place(2)).grid)
+
+
+# In a simulated town, with poses.
+
+
+@pytest.fixture(scope="module")
+def town(simulated_town: tuple[PoseSet, Any]) -> tuple[PoseSet, AerialMap, Any]:
+    pose_set, encoder = simulated_town
+    return pose_set, AerialMap.load(pose_set.map_folder, encoder.fingerprint), encoder
+
+
+def in_town(town: tuple[PoseSet, AerialMap, Any], **alignment: Any) -> Localizer:
+    return Localizer(town[1], town[2], LocalizerConfig(alignment=AlignmentConfig(**alignment)))
+
+
+def seen(localizer: Localizer, scan: RawScan, stamp_ns: int = STAMP_NS, motion: Motion | None = None) -> Estimate:
+    as_scan = dataclasses.replace(scan.as_scan(), stamp_ns=stamp_ns)
+    return localizer.localize(as_scan, scan.up_base, scan.T_base_lidar, motion)
+
+
+def is_right(scan: RawScan, grid: npt.NDArray[np.float64], heading_rad: float) -> bool:
+    turned = abs(wrapped(heading_rad - scan.heading_rad))
+    return bool(np.hypot(*(grid[:2] - scan.T_grid_base[:2, 3])) < 2.0 and turned < np.radians(5.0))
+
+
+@pytest.mark.parametrize("search", ["retrieval", "exhaustive", "auto"])
+def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, AerialMap, Any], search: Any) -> None:
+    localizer = in_town(town, search=search)
+    right = believed = 0
+    scans = [scan for scan in town[0].scans if town[0].on_map[scan.area]]
+    for scan in scans:
+        localizer.reset()
+        estimate = seen(localizer, scan)
+        aligned = estimate.aligned
+        right += is_right(scan, aligned.grid[0], float(aligned.heading_rad[0]))
+        assert aligned.probabilities.sum() <= 1.0 + 1e-9
+        assert estimate.timings.align_ms > 0.0
+        if search == "exhaustive":
+            assert estimate.status is FixStatus.NO_FIX, "one scan alone is no fix"
+        if estimate.state is not TrackState.SEARCHING and np.isfinite(estimate.T_map_base).all():
+            believed += 1
+            turn = float(town[1].frame.convergence_rad(estimate.grid[None])[0])
+            heading = np.arctan2(estimate.T_map_base[1, 0], estimate.T_map_base[0, 0]) + turn
+            assert is_right(scan, estimate.grid, float(heading))
+            assert (np.linalg.eigvalsh(estimate.pose_covariance) > 0.0).all()
+    assert right == len(scans)
+    assert believed >= 3
+
+
+@pytest.mark.parametrize("search", ["retrieval", "auto"])
+def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, Any], search: Any) -> None:
+    localizer = in_town(town, search=search)
+    motion = Motion(np.array([6.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.01]))
+    outside = [scan for scan in town[0].scans if not town[0].on_map[scan.area]]
+    for i, scan in enumerate(outside * 3):
+        estimate = seen(localizer, scan, STAMP_NS + i * 3_000_000_000, motion)
+        assert estimate.status is FixStatus.NO_FIX
+        assert estimate.probability < 0.9
+        assert estimate.reason
+
+
+def upside_down(scan: RawScan) -> RawScan:
+    """Return what a sensor that hangs from its mast sends while everyone believes that it stands."""
+    return dataclasses.replace(scan, points=scan.points * np.float32([1.0, -1.0, -1.0]), up_base=None)
+
+
+def test_a_scan_upside_down_is_no_pose(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    localizer = in_town(town, search="auto")
+    for i, scan in enumerate(town[0].scans[:4]):
+        estimate = seen(localizer, upside_down(scan), STAMP_NS + i * 1_000_000_000)
+        assert estimate.status is FixStatus.NO_FIX
+        assert estimate.reason
+        assert estimate.aligned.probabilities.sum() < 0.5
+
+
+def test_an_empty_scan_leaves_everything_as_it_was(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    empty = Scan(np.empty((0, 3), np.float32), STAMP_NS + 50_000_000, "velodyne")
+    plain, disturbed = (in_town(town, search="retrieval") for _ in range(2))
+    motion = Motion(np.zeros(3), np.diag([0.01, 0.01, 0.001]))
+    for localizer in (plain, disturbed):
+        seen(localizer, town[0].scans[0])
+    estimate = disturbed.localize(empty)
+    assert (estimate.status, estimate.reason) == (FixStatus.NO_FIX, "the scan is empty")
+    assert disturbed.stamp_ns == STAMP_NS
+    one, other = (seen(localizer, town[0].scans[0], STAMP_NS + 10**8, motion) for localizer in (plain, disturbed))
+    np.testing.assert_array_equal(one.grid, other.grid)
+    assert one.probability == other.probability
+
+
+def test_reset_forgets_everything(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    fresh, used = (in_town(town, search="auto") for _ in range(2))
+    first, second = town[0].scans[0], town[0].scans[1]
+    seen(used, first)
+    assert used.stamp_ns == STAMP_NS
+    used.reset()
+    assert used.stamp_ns is None
+    earlier = STAMP_NS - 10**12  # as when a bag is played again
+    one, other = (seen(localizer, second, earlier) for localizer in (fresh, used))
+    np.testing.assert_array_equal(one.aligned.grid, other.aligned.grid)
+    np.testing.assert_array_equal(one.grid, other.grid)
+    assert one.probability == other.probability
+    assert len(one.hypotheses) == len(other.hypotheses)
+
+
+def test_switched_off_there_are_places_but_no_poses(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    estimate = seen(in_town(town, search="off"), town[0].scans[0])
+    assert len(estimate.aligned) == len(estimate.hypotheses) == 0
+    assert len(estimate.candidates) == 25
+    assert np.isfinite(estimate.grid).all()
+    assert estimate.timings.align_ms == 0.0
+
+
+def test_a_pose_is_that_at_the_stamp_not_in_the_middle_of_the_turn(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    scan, later_ns = town[0].scans[0], STAMP_NS + 500_000_000
+    motion = Motion(np.array([1.0, 0.2, 0.1]), np.diag([0.1, 0.1, 0.01]))
+    still = Motion(np.zeros(3), motion.covariance)
+    found = []
+    for given in (still, motion):
+        localizer = in_town(town, search="retrieval")
+        seen(localizer, scan)
+        aligned = seen(localizer, scan, later_ns, given).aligned
+        row = int(np.flatnonzero(aligned.source >= 0)[0])
+        found.append((*aligned.grid[row, :2], aligned.heading_rad[row]))
+    step = np.array(found[1]) - np.array(found[0])
+    heading = found[0][2]
+    c, s = np.cos(heading), np.sin(heading)
+    # A tenth of a second a turn, stamped at its end: half of it is a tenth of the way since the last scan.
+    np.testing.assert_allclose(
+        [c * step[0] + s * step[1], -s * step[0] + c * step[1], step[2]], motion.delta / 10, atol=1e-6
+    )
+
+
+def test_looks_are_due_at_once_then_now_and_then() -> None:
+    looks, second = Looks(1.0, 3.0), 1_000_000_000
+    assert looks.around(0) and looks.everywhere(0)
+    assert looks.around(second // 10), "nothing is known yet: at every scan"
+    assert not looks.everywhere(second // 10)
+    looks.state = TrackState.LOCALIZED
+    assert [looks.around(second // 10 + t * second // 4) for t in range(1, 6)] == [False, False, False, True, False]
+    assert not looks.everywhere(3 * second - 1)
+    assert looks.everywhere(3 * second)
+    assert looks.everywhere(second), "time went backwards"
+    looks.state = TrackState.LOST
+    assert looks.around(3 * second) and looks.around(3 * second)
+    looks.reset()
+    assert looks.state is TrackState.SEARCHING
+    assert looks.around(0) and looks.everywhere(0)
