@@ -46,10 +46,11 @@ class Raster:
     def nearest(self, easting: npt.ArrayLike, northing: npt.ArrayLike) -> Float32Array:
         """Return the heights of the cells that hold the given places, float32 in their shape; NaN outside."""
         e, n = np.broadcast_arrays(np.asarray(easting, np.float64), np.asarray(northing, np.float64))
-        column = np.floor((e - self.west_m) / self.cell_m).astype(np.int64)
-        row = np.ceil((self.north_m - n) / self.cell_m).astype(np.int64) - 1
+        column = np.floor((e - self.west_m) / self.cell_m)
+        row = np.ceil((self.north_m - n) / self.cell_m) - 1
         inside = (row >= 0) & (row < self.values.shape[0]) & (column >= 0) & (column < self.values.shape[1])
-        return np.where(inside, self.values[np.where(inside, row, 0), np.where(inside, column, 0)], np.float32("nan"))
+        rows, columns = (np.where(inside, index, 0.0).astype(np.int64) for index in (row, column))
+        return np.where(inside, self.values[rows, columns], np.float32("nan"))
 
 
 def terrain_raster(points: Float64Array, ground_mask: BoolArray, bounds: Bounds, cell_m: float) -> Raster:

@@ -159,3 +159,28 @@ def test_a_tile_with_canals_takes_well_under_a_second() -> None:
     raster = terrain_raster(points, mask, bounds, 1.0)
     assert time.thread_time() - start < 1.0
     assert np.isfinite(raster.values).all()
+
+
+@pytest.mark.parametrize("cell", [0.5, 1.0, 3.0])
+def test_the_nearest_cell_is_the_one_that_holds_a_place(cell: float) -> None:
+    points = scatter(400, 30.0, 8)
+    highest = surface_raster(points, (WEST, SOUTH, WEST + 30, SOUTH + 30), cell)
+    held = highest.nearest(points[:, 0], points[:, 1])
+    assert held.dtype == np.float32
+    assert (held >= points[:, 2].astype(np.float32)).all(), "each point lies in its cell, no higher than the highest"
+    assert len(np.setdiff1d(held, points[:, 2].astype(np.float32))) == 0
+    corners = highest.nearest([[WEST, WEST + 30 - 1e-6]], [[SOUTH], [SOUTH + 30 - 1e-6]])
+    np.testing.assert_array_equal(corners, highest.values[[-1, 0]][:, [0, -1]])
+
+
+@pytest.mark.filterwarnings("error")
+def test_nearest_knows_nothing_outside_and_in_holes() -> None:
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    values[1, 2] = np.nan
+    raster = Raster(values, WEST, SOUTH + 3.0, 1.0)
+    nan, inf = float("nan"), float("inf")
+    east = [WEST - 1e-6, WEST + 4.0, WEST + 1, WEST + 1, nan, WEST + 1, inf, 1e300, WEST + 2.5]
+    north = [SOUTH + 1, SOUTH + 1, SOUTH - 1e-6, SOUTH + 3.1, SOUTH + 1, nan, SOUTH + 1, SOUTH + 1, SOUTH + 1.5]
+    assert np.isnan(raster.nearest(east, north)).all()
+    assert raster.nearest(WEST + 0.5, SOUTH + 2.5) == 0.0
+    assert raster.nearest(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
