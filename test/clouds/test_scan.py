@@ -238,3 +238,44 @@ def test_the_real_outdoor_scans_ground_goes_even_with_a_wrong_height(
     assert low > 0.8 * counts.received
     assert counts.above_ground < 0.25 * counts.received
     assert counts.above_ground > 0.5 * (counts.received - low)
+
+
+# What the alignment gets: the usable points where they are, beside the patch.
+
+
+@pytest.mark.parametrize("lean_deg", [0.0, 7.0])
+@pytest.mark.parametrize(
+    "mounting",
+    [MountingConfig(z_m=1.2), MountingConfig(x_m=1.5, y_m=-0.7, z_m=1.2, yaw_deg=80.0, roll_deg=-6.0)],
+    ids=["straight", "turned and offset"],
+)
+def test_the_place_holds_each_usable_point_level_and_above_the_ground(
+    cast: Callable[..., Any], mounting: MountingConfig, lean_deg: float
+) -> None:
+    seen = cast(lambda x, y: 0.08 * x, houses())
+    lean = Rotation.from_euler("y", lean_deg, degrees=True).as_matrix()
+    T_level_base = np.eye(4)
+    T_level_base[:3, :3] = lean
+    T_base_lidar = mounting_matrix(mounting)
+    found = prepare(
+        transform_points(T_level_base.T, seen.points), T_base_lidar, gravity_base=lean.T @ np.array([0.0, 0.0, 9.81])
+    )
+    sensor = lean @ T_base_lidar[:3, 3]
+    assert found.sensor_height_m == pytest.approx(sensor[2], abs=1e-6)
+    assert len(found.place) == len(found.level_z_m) == found.counts.off_body
+    level = np.column_stack([found.place[:, :2] + sensor[:2], found.level_z_m])
+    away, whose = cKDTree(seen.points).query(level)
+    assert away.max() < 1e-3, "every point is one of the scan's, levelled, from the sensor"
+    assert len(np.unique(whose)) == len(whose)
+    assert np.median(np.abs(found.place[:, 2] - seen.height_m[whose])) < 0.15
+    walls = seen.height_m[whose] > 2.0
+    assert np.median(np.abs(found.place[walls, 2] - seen.height_m[whose][walls])) < 0.3
+
+
+def test_the_place_is_there_even_where_there_is_no_patch(cast: Callable[..., Any]) -> None:
+    field = prepare(cast(lambda x, y: 0.0 * x, []).points)
+    assert field.patch is None
+    assert len(field.place) == field.counts.off_body > 1000
+    assert np.abs(field.place[:, 2]).max() < 0.4
+    nothing = prepare(np.empty((0, 3), np.float32))
+    assert nothing.place.shape == (0, 3) and nothing.level_z_m.shape == (0,)
