@@ -195,9 +195,10 @@ def predict_all(evaluation_set: EvaluationSet, job: EncodingJob, plan: Plan, wei
         for mode, count, way, descriptors in ways:
             if count not in timed:
                 timed[count] = time_queries(job.encoder, queries, count, database, top)
+            encode_ms, search_ms = timed[count]
             about = About(
                 evaluation_set.name, fingerprint, weights, job.encoder.fingerprint, setting, mode, count, way,
-                len(database), job.encoder.descriptor_size, *(round(ms, 3) for ms in timed[count]),
+                len(database), job.encoder.descriptor_size, round(encode_ms, 3), round(search_ms, 3),
             )  # fmt: skip
             if index is not None:
                 found = nearest(index, descriptors, top)

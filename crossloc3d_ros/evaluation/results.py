@@ -54,6 +54,7 @@ def as_json(scores: Sequence[Scores]) -> str:
     content = [
         {
             "about": dataclasses.asdict(each.about),
+            "kind": each.about.kind,
             "figures": list(_rows(each)),
             "heading": None if each.heading is None else dataclasses.asdict(each.heading),
             "curves": [
