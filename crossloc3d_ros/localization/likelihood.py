@@ -110,11 +110,14 @@ class MapLikelihood:
             nothing = np.full((cells, cells), np.nan, np.float32)
             return nothing, nothing
         inside = (max(bounds[0], low_e), max(bounds[1], low_n), min(bounds[2], high_e), min(bounds[3], high_n))
-        easting = west + (np.arange(cells) + 0.5) * CELL_M
-        northing = south + (np.arange(cells) + 0.5) * CELL_M
-        at = np.meshgrid(easting, northing)
         terrain, surface = self.aerial_map.terrain(inside), self.aerial_map.surface(inside)
-        return terrain.sample(*at), surface.nearest(*at)
+        middles = (np.arange(cells) + 0.5) * CELL_M
+        # Of a finer raster the highest cell counts, as it would in one of 1 m.
+        parts = max(math.ceil(CELL_M / surface.cell_m - 1e-6), 1)
+        finer = (np.arange(parts * cells) + 0.5) * (CELL_M / parts)
+        heights = surface.nearest(*np.meshgrid(west + finer, south + finer)).reshape(cells, parts, cells, parts)
+        highest: Float32Array = np.fmax.reduce(np.fmax.reduce(heights, axis=3), axis=1)
+        return terrain.sample(*np.meshgrid(west + middles, south + middles)), highest
 
 
 def coarse_ratios(log_ratios: Float32Array, classes: Int32Array, cell: int) -> Int16Array:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS, REACH_M
+from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS, REACH_M, evidence_of
 from crossloc3d_ros.localization.likelihood import LEVELS_M, QUANTA, MapLikelihood, coarse_ratios
 from crossloc3d_ros.localization.observation_model import CLASSES, UNKNOWN, ObservationModel, surface_classes
+from crossloc3d_ros.localization.search import inside
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import Float32Array
 
@@ -177,6 +178,26 @@ def test_rasters_of_other_cells_are_compared_in_metres(map_of: Maker, tmp_path: 
     np.testing.assert_allclose(roof.max(axis=0) - roof.min(axis=0) + 1, [16 - 4, 24 - 4], atol=1.01)
 
 
+@pytest.mark.parametrize("parts", [2, 4])
+def test_of_a_finer_raster_the_highest_counts(map_of: Maker, tmp_path: Path, parts: int) -> None:
+    """A map of finer cells is the same map: nothing is shifted by half a cell, and no thin wall is lost."""
+    rng = np.random.default_rng(9)
+    size = 80 * parts
+    fine = np.where(rng.random((size, size)) < 0.1 / parts, rng.uniform(1.0, 12.0, (size, size)), 0.0) + 5.0
+    fine[rng.random((size, size)) < 0.05] = np.nan
+    with np.errstate(invalid="ignore"):
+        whole = np.fmax.reduce(np.fmax.reduce(fine.reshape(80, parts, 80, parts), axis=3), axis=1)
+    classes = []
+    for name, surface in (("fine", fine), ("whole", whole)):
+        surface = surface.astype(np.float32)
+        cell_m = 80.0 / len(surface)
+        made = map_of(tmp_path / name, np.full_like(surface, 5.0), surface, 628_000.0, 5_803_000.0, cell_m)
+        likelihood = MapLikelihood(made, MODEL)
+        likelihood.prepare()
+        classes.append(likelihood.classes)
+    np.testing.assert_array_equal(*classes)
+
+
 def test_maps_that_lack_half_are_known_in_the_other(map_of: Maker, tmp_path: Path) -> None:
     terrain, surface = heights(100, 120)
     full = MapLikelihood(map_of(tmp_path / "full", terrain, surface), MODEL)
@@ -202,3 +223,21 @@ def test_a_town_of_boxes_is_open_on_its_streets(box_map: AerialMap, box_town: An
     low_return = MODEL.log_ratios[1, classes]
     assert low_return[high].mean() > 0.5
     assert low_return[~high].mean() < -1.0
+
+
+def test_evidence_laid_at_the_map_s_edge_stays_inside_of_the_levels(box_map: AerialMap) -> None:
+    """The search reads memory at offsets that nobody checks again."""
+    likelihood = MapLikelihood(box_map, MODEL)
+    angle = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    far = np.column_stack([140.0 * np.cos(angle), 140.0 * np.sin(angle), np.full(720, 2.0)]).astype(np.float32)
+    for sensor_xy in ((0.0, 0.0), (20.0, -20.0)):
+        seen = evidence_of(far, 1.2, sensor_xy)
+        for level in likelihood.levels:
+            evidence = seen.coarser(level.cell_m, 10**6, 10**6)
+            reach = np.hypot(*evidence.xy_m.T).max() / level.cell_m
+            assert reach > 85.0 / level.cell_m
+            rows, columns = np.nonzero(inside(likelihood, level))
+            _, height, width = level.ratios.shape
+            for low, high, size in ((rows.min(), rows.max(), height), (columns.min(), columns.max(), width)):
+                assert low + math.floor(-reach) >= 0
+                assert high + math.floor(reach + 0.5) < size
