@@ -41,11 +41,11 @@ from crossloc3d_ros.types import (
     no_aligned_poses,
 )
 
-_COARSE_RETURNS, _COARSE_PASSAGES = 160, 200
+COARSE_RETURNS, COARSE_PASSAGES = 160, 200
 _MIDDLE_RETURNS, _MIDDLE_PASSAGES = 500, 500
 _CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
 _FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
-_COARSE_HEADINGS = 48
+COARSE_HEADINGS = 48
 _APART_M = 8.0
 _PLACE_M = 35.0  # so far from the centre of its submap a pose still is of its place
 _UNSEEN = 0.2  # likelihood ratio of a place that is not among the candidates
@@ -137,7 +137,7 @@ class Aligner:
     def _found(self, evidence: Evidence, places: Float64Array, everywhere: bool) -> Peaks:
         """Return the best peaks around the places (k, 3) and, where asked, of the whole map, on the middle level."""
         coarse, middle = self.likelihood.levels
-        laid = evidence.coarser(coarse.cell_m, _COARSE_RETURNS, _COARSE_PASSAGES)
+        laid = evidence.coarser(coarse.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
         sought = []
         if everywhere:
             self.likelihood.prepare()
@@ -147,7 +147,7 @@ class Aligner:
             marked = around(self.likelihood, coarse, self._local(places[:, :2]), self.config.radius_m)
             sought.append((marked, self.config.peaks, 1))
         seeds = [
-            search_cells(laid, coarse, cells, _COARSE_HEADINGS, most, _APART_M, threads).poses
+            search_cells(laid, coarse, cells, COARSE_HEADINGS, most, _APART_M, threads).poses
             for cells, most, threads in sought
         ]
         if not sum(len(poses) for poses in seeds):
