@@ -117,8 +117,8 @@ def test_nothing_marked_and_nothing_seen_find_nothing() -> None:
 
 
 def test_sums_of_coarse_ratios_fit_into_16_bits() -> None:
-    returns = alignment._COARSE_RETURNS * math.ceil(QUANTA * observation_model._STEEPEST)
-    assert returns + alignment._COARSE_PASSAGES * 100 <= np.iinfo(np.int16).max
+    returns = alignment.COARSE_RETURNS * math.ceil(QUANTA * observation_model._STEEPEST)
+    assert returns + alignment.COARSE_PASSAGES * 100 <= np.iinfo(np.int16).max
 
 
 @pytest.mark.parametrize("cell_m", [1.0, 2.0])
