@@ -20,14 +20,16 @@ from crossloc3d_ros.config import (
     LocalizerConfig,
     PreprocessingConfig,
 )
-from crossloc3d_ros.evaluation.pose_sets import PoseSet
+from crossloc3d_ros.evaluation.pose_sets import PoseSet, placed_town
 from crossloc3d_ros.evaluation.raw_scans import RawScan
+from crossloc3d_ros.evaluation.simulated import BenchmarkTown
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import Localizer, Looks
 from crossloc3d_ros.localization.odometry import Motion
 from crossloc3d_ros.localization.search import wrapped
 from crossloc3d_ros.places.descriptor_map import DescriptorMap
 from crossloc3d_ros.places.store import AerialMap, BuildCounts, Manifest, SubmapTable
+from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 
 Float32 = npt.NDArray[np.float32]
@@ -236,6 +238,46 @@ def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, 
         assert estimate.status is FixStatus.NO_FIX
         assert estimate.probability < 0.9
         assert estimate.reason
+
+
+def drive(pose_set: PoseSet, start: RawScan, metres: Sequence[float]) -> list[RawScan]:
+    """Scan the town of the set again, so many metres ahead of where a scan was taken."""
+    town = BenchmarkTown("estate", 990_112, False)
+    world, _ = placed_town(town, 1 - town.seed % 2, 300.0, (0.0, 0.0))
+    rng, scans = np.random.default_rng(1), []
+    for ahead in metres:
+        T_grid_base = start.T_grid_base.copy()
+        T_grid_base[:3, 3] += ahead * start.T_grid_base[:3, 0]
+        local = T_grid_base.copy()
+        local[:3, 3] -= world.origin_grid
+        points = Vlp16().scan(world.scene, local @ start.T_base_lidar, rng).points
+        scans.append(dataclasses.replace(start, points=points, T_grid_base=T_grid_base))
+    return scans
+
+
+def test_a_drive_leads_to_a_fix_and_being_carried_away_ends_it(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    pose_set = town[0]
+    localizer = in_town(town, search="auto")
+    ahead = Motion(np.array([2.0, 0.0, 0.0]), np.diag([0.05, 0.05, 0.01]) ** 2)
+    states, stamp_ns = [], STAMP_NS
+    for scan in drive(pose_set, pose_set.scans[4], np.arange(-12.0, 6.0, 2.0)):
+        estimate = seen(localizer, scan, stamp_ns, ahead if localizer.stamp_ns is not None else None)
+        stamp_ns += 1_000_000_000
+        states.append(estimate.status)
+        if estimate.status is FixStatus.FIX:
+            error = (estimate.grid - scan.T_grid_base[:3, 3])[:2]
+            assert np.hypot(*error) < 1.0
+            assert error @ np.linalg.inv(estimate.covariance[:2, :2]) @ error < 16.0
+            assert estimate.state is TrackState.LOCALIZED
+    assert states[0] is FixStatus.NO_FIX, "one scan is no drive"
+    assert states[-1] is FixStatus.FIX
+    outside = [scan for scan in pose_set.scans if not pose_set.on_map[scan.area]]
+    for scan in outside * 4:
+        estimate = seen(localizer, scan, stamp_ns, Motion(np.array([4.0, 0.0, 0.0]), ahead.covariance))
+        stamp_ns += 1_000_000_000
+    assert estimate.status is FixStatus.NO_FIX
+    assert estimate.probability < 0.9
+    assert estimate.reason
 
 
 def upside_down(scan: RawScan) -> RawScan:
