@@ -233,7 +233,7 @@ def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, 
     localizer = in_town(town, search=search)
     motion = Motion(np.array([6.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.01]))
     outside = [scan for scan in town[0].scans if not town[0].on_map[scan.area]]
-    for i, scan in enumerate(outside * 3):
+    for i, scan in enumerate(outside * 2):
         estimate = seen(localizer, scan, STAMP_NS + i * 3_000_000_000, motion)
         assert estimate.status is FixStatus.NO_FIX
         assert estimate.probability < 0.9
@@ -272,7 +272,7 @@ def test_a_drive_leads_to_a_fix_and_being_carried_away_ends_it(town: tuple[PoseS
     assert states[0] is FixStatus.NO_FIX, "one scan is no drive"
     assert states[-1] is FixStatus.FIX
     outside = [scan for scan in pose_set.scans if not pose_set.on_map[scan.area]]
-    for scan in outside * 4:
+    for scan in outside * 3:
         estimate = seen(localizer, scan, stamp_ns, Motion(np.array([4.0, 0.0, 0.0]), ahead.covariance))
         stamp_ns += 1_000_000_000
     assert estimate.status is FixStatus.NO_FIX

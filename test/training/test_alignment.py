@@ -57,13 +57,13 @@ def drawn(share: float, temperature: float, count: int, seed: int) -> list[Answe
 
 @pytest.mark.parametrize(("share", "temperature"), [(0.5, 12.0), (0.35, 25.0)])
 def test_the_calibration_that_made_the_answers_is_found(share: float, temperature: float) -> None:
-    found_share, found_temperature = calibrate(drawn(share, temperature, 1000, 1))
+    found_share, found_temperature = calibrate(drawn(share, temperature, 600, 1))
     assert found_share == pytest.approx(share, abs=0.03)
     assert found_temperature == pytest.approx(temperature, rel=0.2)
 
 
 def test_probabilities_after_the_calibration_are_shares_of_what_is_right() -> None:
-    share, temperature = calibrate(drawn(0.5, 15.0, 1000, 2))
+    share, temperature = calibrate(drawn(0.5, 15.0, 600, 2))
     believed, right = [], []
     for answer in drawn(0.5, 15.0, 1000, 3):
         log_odds = (answer.scores - share * answer.expected) / temperature + answer.log_prior
@@ -76,7 +76,7 @@ def test_probabilities_after_the_calibration_are_shares_of_what_is_right() -> No
 
 
 def test_answers_without_any_pose_do_no_harm() -> None:
-    answers = drawn(0.5, 12.0, 200, 4)
+    answers = drawn(0.5, 12.0, 100, 4)
     nothing = Answer(np.empty(0), 300.0, None, -7.0)
     np.testing.assert_allclose(calibrate([*answers, nothing]), calibrate(answers), rtol=1e-3)
 
