@@ -24,7 +24,7 @@ $(VENV)/.ready: setup.py
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "Python's venv is missing; try: sudo apt-get install python3-venv"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -c 'import torch' 2>/dev/null || $(PIP) install --quiet --retries 1 --timeout 15 --extra-index-url $(TORCH_INDEX) '$(TORCH)'
-	$(PIP) install --quiet --editable '.[ros,cluster,test]'
+	$(PIP) install --quiet --editable '.[ros,odometry,cluster,test]'
 	touch $@
 
 demo: setup

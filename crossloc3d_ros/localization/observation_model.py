@@ -22,17 +22,20 @@ from scipy import ndimage
 
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS
-from crossloc3d_ros.types import Float32Array, Float64Array, Int32Array
+from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array
 
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "alignment.safetensors"
 HEIGHTS_M = np.array([0.4, 1.2, 2.5, 5.0, 10.0])
 """Heights above the terrain between which the classes change."""
 _STEPS = len(HEIGHTS_M) + 1
 _ROUGH_M = 2.0  # mean bend of the surface from which it is a crown rather than a roof
-UNKNOWN = 2 * _STEPS**3
+_HOLE_M = 20  # half the width of the widest hole in a survey that is taken for water
+HOLE = 2 * _STEPS**3
+"""Class of a cell without an echo in the midst of those that have one: mostly water, which mirrors pulses away."""
+UNKNOWN = HOLE + 1
 """Class of a cell of which the survey says nothing."""
 CLASSES = UNKNOWN + 1
-MARGIN_CELLS = 3
+MARGIN_CELLS = 2 * _HOLE_M + 2
 """So far beyond its edges a raster must be known for the classes inside to be right."""
 _PRIOR = 50.0  # observations that a class starts with
 _STEEPEST = 4.0  # no single cell says more; the search's 16 bit numbers rest on it
@@ -95,7 +98,18 @@ def surface_classes(terrain: Float32Array, surface: Float32Array) -> Int32Array:
     rough = ndimage.uniform_filter(np.abs(ndimage.laplace(held)), 3) > _ROUGH_M
     steps = [np.digitize(values, HEIGHTS_M) for values in (held, lowest, highest)]
     classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * 2 + rough
-    return np.where(known, classes, UNKNOWN).astype(np.int32)
+    return np.where(known, classes, np.where(_holes(known), HOLE, UNKNOWN)).astype(np.int32)
+
+
+def _holes(known: BoolArray) -> BoolArray:
+    """Mark the cells that a disc of `_HOLE_M` closes between known ones; beyond the array nothing is known."""
+    if known.all() or not known.any():
+        return np.zeros(known.shape, np.bool_)
+    padded = np.pad(known, _HOLE_M + 1)
+    closed = ndimage.distance_transform_edt(~padded) <= _HOLE_M
+    closed = ndimage.distance_transform_edt(closed) > _HOLE_M
+    inner = slice(_HOLE_M + 1, -_HOLE_M - 1)
+    return np.asarray(closed[inner, inner] & ~known)
 
 
 def fit_log_ratios(seen: Float64Array) -> tuple[Float32Array, Float64Array]:
