@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from safetensors.numpy import save_file
 
@@ -15,6 +16,7 @@ from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS
 from crossloc3d_ros.localization.observation_model import (
     CLASSES,
     HEIGHTS_M,
+    HOLE,
     MARGIN_CELLS,
     UNKNOWN,
     ObservationModel,
@@ -38,6 +40,14 @@ def heights(seed: int, holes: float = 0.1, size: int = 24) -> tuple[Float32Array
     return terrain.astype(np.float32), surface.astype(np.float32)
 
 
+def in_a_hole(known: npt.NDArray[np.bool_], i: int, j: int) -> bool:
+    """Say whether no disc of 20 m that holds the cell is free of known ones, wherever it lies."""
+    places = np.argwhere(known)
+    offsets = np.stack(np.meshgrid(np.arange(-20, 21), np.arange(-20, 21)), -1).reshape(-1, 2)
+    middles = np.array([i, j]) + offsets[(offsets**2).sum(axis=1) <= 20**2]
+    return bool((((middles[:, None] - places[None]) ** 2).sum(axis=2).min(axis=1) <= 20**2).all())
+
+
 def class_by_hand(above: Float32Array, i: int, j: int) -> int:
     """Return the class of one cell from its neighbours, edges mirrored as SciPy does."""
     rows, columns = above.shape
@@ -51,7 +61,7 @@ def class_by_hand(above: Float32Array, i: int, j: int) -> int:
         return at(r, c) if math.isfinite(at(r, c)) else 0.0
 
     if not math.isfinite(above[i, j]):
-        return UNKNOWN
+        return HOLE if in_a_hole(np.isfinite(above), i, j) else UNKNOWN
     around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)]
     known = [at(*cell) for cell in around if math.isfinite(at(*cell))]
     bend = 0.0
@@ -69,18 +79,31 @@ def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
     expected = [[class_by_hand(surface - terrain, i, j) for j in range(24)] for i in range(24)]
     np.testing.assert_array_equal(classes, expected)
     assert len(np.unique(classes)) > 50
-    assert (classes[np.isnan(surface) | np.isnan(terrain)] == UNKNOWN).all()
+    assert (classes[np.isnan(surface) | np.isnan(terrain)] >= HOLE).all()
     assert 0 <= classes.min() <= classes.max() < CLASSES
 
 
 def test_a_cell_s_class_depends_on_no_more_than_the_margin() -> None:
-    terrain, surface = heights(5, size=40)
-    part = slice(10, 30)
-    inner = surface_classes(terrain[part, part], surface[part, part])[
-        MARGIN_CELLS:-MARGIN_CELLS, MARGIN_CELLS:-MARGIN_CELLS
-    ]
-    whole = surface_classes(terrain, surface)[part, part]
-    np.testing.assert_array_equal(inner, whole[MARGIN_CELLS:-MARGIN_CELLS, MARGIN_CELLS:-MARGIN_CELLS])
+    terrain, surface = heights(5, size=200)
+    surface[60:90, 20:190] = np.nan  # a canal
+    surface[120:180, 100:170] = np.nan  # more than a hole
+    whole = surface_classes(terrain, surface)
+    for start, stop in ((30, 150), (75, 200)):
+        part, inner = slice(start, stop), slice(MARGIN_CELLS, stop - start - MARGIN_CELLS)
+        classes = surface_classes(terrain[part, part], surface[part, part])
+        np.testing.assert_array_equal(classes[inner, inner], whole[part, part][inner, inner])
+
+
+def test_a_canal_is_a_hole_and_what_was_not_flown_over_is_none() -> None:
+    terrain, surface = (np.full((160, 160), height, np.float32) for height in (3.0, 3.1))
+    surface[50:80] = np.nan
+    surface[:, 130:] = np.nan
+    classes = surface_classes(terrain, surface)
+    assert (classes[50:80, 30:100] == HOLE).all()
+    assert (classes[:, 130:] == UNKNOWN).all()
+    wide = surface.copy()
+    wide[40:90] = np.nan
+    assert (surface_classes(terrain, wide)[62:68] == UNKNOWN).all(), "50 m without an echo may be anything"
 
 
 def test_of_a_map_without_terrain_nothing_is_known() -> None:
