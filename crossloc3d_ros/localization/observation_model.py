@@ -64,6 +64,7 @@ class ObservationModel:
         tensors: dict[str, np.ndarray] = {"log_ratios": self.log_ratios, "expected": self.expected}
         settings = {"expected_share": self.expected_share, "temperature": self.temperature}
         save_file(tensors, path, metadata={"calibration": json.dumps(settings)})
+        path.chmod(0o644)  # safetensors keeps it from everybody else, also from the robot's user
 
     @classmethod
     def load(cls, path: Path | None = None) -> ObservationModel:
