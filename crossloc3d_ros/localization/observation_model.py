@@ -35,7 +35,7 @@ HOLE = 2 * _STEPS**3
 UNKNOWN = HOLE + 1
 """Class of a cell of which the survey says nothing."""
 CLASSES = UNKNOWN + 1
-MARGIN_CELLS = 2 * _HOLE_M + 2
+MARGIN_CELLS = 2 * _HOLE_M + 4
 """So far beyond its edges a raster must be known for the classes inside to be right."""
 _PRIOR = 50.0  # observations that a class starts with
 _STEEPEST = 4.0  # no single cell says more; the search's 16 bit numbers rest on it
@@ -90,16 +90,29 @@ def _load(path: Path) -> ObservationModel:
 
 
 def surface_classes(terrain: Float32Array, surface: Float32Array) -> Int32Array:
-    """Return the class (H, W) of each cell of 1 m from terrain and surface (H, W) in metres, NaN where unknown."""
+    """Return the class (H, W) of each cell of 1 m from terrain and surface (H, W) in metres, NaN where unknown.
+
+    A gap inside of the survey is as high as the mean of its eight neighbours with an echo: sparse surveys have many.
+    """
     above = surface - terrain
     known = np.isfinite(above)
+    if not known.any():
+        return np.full(above.shape, UNKNOWN, np.int32)
+    if not known.all():
+        holes = _holes(known)
+        weight = ndimage.uniform_filter(known.astype(np.float32), 3, mode="constant")
+        total = ndimage.uniform_filter(np.where(known, above, 0.0), 3, mode="constant")
+        filled = holes & (weight > 0.05)  # a ninth for each
+        above = np.where(known, above, np.where(filled, total / np.where(filled, weight, 1.0), np.nan))
+        known = np.isfinite(above)
+        unseen = np.where(holes, HOLE, UNKNOWN)
     held = np.where(known, above, 0.0)
     highest = ndimage.maximum_filter(np.where(known, above, -np.inf), 3)
     lowest = ndimage.minimum_filter(np.where(known, above, np.inf), 3)
     rough = ndimage.uniform_filter(np.abs(ndimage.laplace(held)), 3) > _ROUGH_M
     steps = [np.digitize(values, HEIGHTS_M) for values in (held, lowest, highest)]
     classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * 2 + rough
-    return np.where(known, classes, np.where(_holes(known), HOLE, UNKNOWN)).astype(np.int32)
+    return (classes if known.all() else np.where(known, classes, unseen)).astype(np.int32)
 
 
 def _holes(known: BoolArray) -> BoolArray:
