@@ -15,7 +15,7 @@ from crossloc3d_ros.evaluation.replay_charts import STATE_WORDS, WORST, class_of
 from crossloc3d_ros.evaluation.truth import jumped
 from crossloc3d_ros.evaluation.wording import rounded
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.types import EXHAUSTIVE, Float64Array
+from crossloc3d_ros.types import BoolArray, EXHAUSTIVE, Float64Array
 
 SHOWN_CANDIDATES = 10
 SHOWN_POSES = 6
@@ -151,7 +151,7 @@ def to_view(grid: Float64Array, backdrop: Backdrop) -> Float64Array:
 def grid_turn_rad(table: EstimateTable, frame: MapFrame) -> Float64Array:
     """Return the angle (S,) that makes a heading from true east one from grid east."""
     places = np.where(np.isfinite(table.truth_grid), table.truth_grid, table.grid[:, :2])
-    known = np.isfinite(places).all(axis=1)
+    known: BoolArray = np.asarray(np.isfinite(places).all(axis=1))
     places = np.column_stack([np.where(known[:, None], places, frame.origin[:2]), np.full(len(table), frame.origin[2])])
     return frame.convergence_rad(places) if len(table) else np.empty(0)
 
