@@ -15,7 +15,7 @@ from crossloc3d_ros.evaluation.replay_charts import STATE_WORDS, WORST, class_of
 from crossloc3d_ros.evaluation.truth import jumped
 from crossloc3d_ros.evaluation.wording import rounded
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.types import BoolArray, EXHAUSTIVE, Float64Array
+from crossloc3d_ros.types import EXHAUSTIVE, BoolArray, Float64Array
 
 SHOWN_CANDIDATES = 10
 SHOWN_POSES = 6
