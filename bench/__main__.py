@@ -13,7 +13,7 @@ import platform
 import resource
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.alignment import bench_alignment
-from bench.figure import Figure
+from bench.figure import Figure, median_ms
 from bench.flops import descriptor_flops
 from bench.simulation import bench_simulation
 from crossloc3d_ros.cli.common import ProgressDisplay, console, run
@@ -92,18 +92,6 @@ def _finish(figures: list[Figure], output: Path, target: Console) -> None:
     record = {"machine": machine(), "figures": [asdict(figure) for figure in figures]}
     (output / "bench.json").write_text(json.dumps(record, indent=2))
     target.print(f"written to {output / 'bench.json'}")
-
-
-def median_ms(action: Callable[[], Any], runs: int) -> float:
-    """Return the median of `runs` timings of a warm action, in milliseconds."""
-    for _ in range(3):
-        action()
-    times = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - began)
-    return 1e3 * float(np.median(times))
 
 
 def matrix_peak(size: int = 1536) -> dict[int, float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.figure import Figure
+from bench.figure import Figure, median_ms
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.localization.alignment import COARSE_HEADINGS, COARSE_PASSAGES, COARSE_RETURNS, Aligner
@@ -51,9 +51,9 @@ def bench_alignment(aerial_map: AerialMap, scans: list[PreparedScan], runs: int)
 
     for count, target in ((25, "150, goal 60"), (100, "")):
         name = f"alignment: {count} candidates, one thread"
-        figures.append(Figure(name, _median_ms(of(count), runs), "ms", target, note="places drawn by lot"))
-    figures.append(Figure("alignment: one hypothesis", _median_ms(followed, runs), "ms"))
-    figures.append(Figure("alignment: the whole map", _median_ms(everywhere, max(runs // 4, 3)), "ms"))
+        figures.append(Figure(name, median_ms(of(count), runs), "ms", target, note="places drawn by lot"))
+    figures.append(Figure("alignment: one hypothesis", median_ms(followed, runs), "ms"))
+    figures.append(Figure("alignment: the whole map", median_ms(everywhere, max(runs // 4, 3)), "ms"))
     figures.append(_large(aligner, evidence_of(scans[0].place, scans[0].sensor_height_m)))
     return figures
 
@@ -77,14 +77,3 @@ def _large(aligner: Aligner, evidence: Evidence) -> Figure:
         f"alignment: every pose of {LARGE_KM2:g} km2, coarse, {threads} threads", seconds, "s", "3",
         note=f"from {area:.2f} km2",
     )  # fmt: skip
-
-
-def _median_ms(action: Callable[[], Any], runs: int) -> float:
-    for _ in range(2):
-        action()
-    times = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        action()
-        times.append(time.perf_counter() - began)
-    return 1e3 * float(np.median(times))

@@ -21,6 +21,7 @@ from crossloc3d_ros.localization.likelihood import MapLikelihood
 from crossloc3d_ros.localization.observation_model import ObservationModel
 from crossloc3d_ros.localization.search import (
     Peaks,
+    are_near,
     around,
     climb,
     inside,
@@ -241,11 +242,6 @@ def moved(aligned: AlignedPoses, step: Float64Array) -> AlignedPoses:
 
 def _repeated(poses: Float64Array) -> np.ndarray:
     """Mark the poses (n, 3), best first, that are the same as a better one."""
-    repeated = np.zeros(len(poses), np.bool_)
-    for i in range(len(poses)):
-        for j in range(i):
-            near = math.hypot(*(poses[i, :2] - poses[j, :2])) < _SAME_M
-            if near and abs(wrapped(float(poses[i, 2] - poses[j, 2]))) < _SAME_RAD:
-                repeated[i] = True
-                break
-    return repeated
+    return np.array(
+        [any(are_near(poses[i], poses[j], _SAME_M, _SAME_RAD) for j in range(i)) for i in range(len(poses))], np.bool_
+    )

@@ -117,8 +117,6 @@ def surface_classes(terrain: Float32Array, surface: Float32Array) -> Int32Array:
 
 def _holes(known: BoolArray) -> BoolArray:
     """Mark the cells that a disc of `_HOLE_M` closes between known ones; beyond the array nothing is known."""
-    if known.all() or not known.any():
-        return np.zeros(known.shape, np.bool_)
     padded = np.pad(known, _HOLE_M + 1)
     closed = ndimage.distance_transform_edt(~padded) <= _HOLE_M
     closed = ndimage.distance_transform_edt(closed) > _HOLE_M

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from crossloc3d_ros.localization.evidence import CELL_M, LAYERS, Evidence
-from crossloc3d_ros.localization.likelihood import Int16Array, Level, MapLikelihood, UInt16Array
+from crossloc3d_ros.localization.likelihood import QUANTA, Int16Array, Level, MapLikelihood, UInt16Array
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 _STEPS = ((1.0, math.radians(2.0)), (0.5, math.radians(1.0)), (0.25, math.radians(0.5)), (0.12, math.radians(0.25)))
@@ -66,7 +66,7 @@ def search_cells(
     ways = np.column_stack([columns + 0.5, rows + 0.5]) * level.cell_m
     chosen = _apart(ways, best.astype(np.float64), most, apart_m)
     poses = np.column_stack([ways[chosen], angles[heading[chosen]]])
-    return Peaks(poses, best[chosen] / 8.0)
+    return Peaks(poses, best[chosen] / QUANTA)
 
 
 def climb(
@@ -104,22 +104,22 @@ def local_search(
         level.ratios, np.ascontiguousarray(evidence.xy_m), evidence.channel, level.cell_m,
         np.ascontiguousarray(poses, np.float64), round(reach_m / level.cell_m), turn_rad / max(turns, 1), turns, LAYERS,
     )  # fmt: skip
-    return Peaks(found, scores / 8.0)
+    return Peaks(found, scores / QUANTA)
 
 
 def merge(peaks: Peaks, apart_m: float, apart_rad: float) -> Int64Array:
     """Return which peaks to keep, best first: one of those nearer than both to a better one."""
     kept: list[int] = []
     for i in np.argsort(-peaks.scores, kind="stable"):
-        near = [
-            j
-            for j in kept
-            if math.hypot(*(peaks.poses[i, :2] - peaks.poses[j, :2])) < apart_m
-            and abs(wrapped(float(peaks.poses[i, 2] - peaks.poses[j, 2]))) < apart_rad
-        ]
-        if not near:
+        if not any(are_near(peaks.poses[i], peaks.poses[j], apart_m, apart_rad) for j in kept):
             kept.append(int(i))
     return np.array(kept, np.int64)
+
+
+def are_near(first: Float64Array, second: Float64Array, apart_m: float, apart_rad: float) -> bool:
+    """Return whether two poses (3,) are nearer to each other than both bounds."""
+    turned = abs(wrapped(float(first[2] - second[2])))
+    return math.hypot(*(first[:2] - second[:2])) < apart_m and turned < apart_rad
 
 
 def wrapped(angle: float) -> float:
