@@ -24,6 +24,7 @@ from crossloc3d_ros.cli.common import (
     add_options,
     add_verbosity,
     console,
+    interrupts_held,
     run,
     set_up_logging,
 )
@@ -49,6 +50,7 @@ from crossloc3d_ros.evaluation.wording import degrees, metres, percent
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.types import Estimate
 
 PAGE = "index.html"
 ROS_ARGUMENTS = "--ros-args"
@@ -148,9 +150,15 @@ def _replay(arguments: argparse.Namespace) -> int:
         remove_results(folder)
         moved = odometry_words(odometry)
         target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps; odometry: {moved}")
-        localizer.warm_up()
-        with ProgressDisplay(target) as display:
+        with interrupts_held() as let_through, ProgressDisplay(target) as display:
+
+            def show(done: int, total: int, _: Estimate) -> None:
+                display("localize", done, total, "scans")
+                let_through()
+
             try:
+                localizer.warm_up()
+                let_through()
                 localize_bag(
                     bag,
                     topic,
@@ -160,7 +168,7 @@ def _replay(arguments: argparse.Namespace) -> int:
                     imu_topic=arguments.imu_topic,
                     imu_time_constant_s=config.imu_time_constant_s,
                     odometry=odometry,
-                    progress=lambda done, total, _: display("localize", done, total, "scans"),
+                    progress=show,
                 )
             except BagError as error:
                 broken = error  # what was read before the damage is worth its figures

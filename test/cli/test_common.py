@@ -10,7 +10,7 @@ import signal
 import pytest
 from rich.console import Console
 
-from crossloc3d_ros.cli.common import ProgressDisplay, add_options, read_options, run
+from crossloc3d_ros.cli.common import ProgressDisplay, add_options, interrupts_held, read_options, run
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.errors import ConfigError, MapError
 
@@ -36,6 +36,46 @@ def test_being_terminated_is_being_interrupted() -> None:
     before = signal.getsignal(signal.SIGTERM)
     assert run(lambda: os.kill(os.getpid(), signal.SIGTERM)) == 130
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_held_interrupt_comes_through_between_steps(number: int) -> None:
+    steps: list[str] = []
+
+    def action() -> None:
+        with interrupts_held() as let_through:
+            let_through()
+            os.kill(os.getpid(), number)
+            steps.append("finished")
+            let_through()
+            steps.append("another")
+
+    before = signal.getsignal(signal.SIGINT)
+    assert run(action) == 130
+    assert steps == ["finished"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_interrupt_is_not_held() -> None:
+    def action() -> None:
+        with interrupts_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            pytest.fail("still running")
+
+    assert run(action) == 130
+
+
+def test_an_interrupt_inside_of_loading_compiled_code_is_one() -> None:
+    def action() -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    assert run(action) == 130
+    with pytest.raises(SystemError):
+        run(raising(SystemError("another")))  # type: ignore[arg-type]
 
 
 def parse(kind: type, arguments: list[str], names: list[str] | None = None) -> object:
