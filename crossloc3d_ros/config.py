@@ -128,7 +128,8 @@ class AlignmentConfig:
     exhaustive_km2: float = option(6.0, "largest map that auto searches as a whole", low=0.0, high=1e6)
     exhaustive_every_s: float = option(3.0, "the whole map is searched no more often", low=0.0, high=1e6)
     convincing: float = option(0.9, "auto does not where a pose at a candidate is believed so", low=0.0, high=1.0)
-    look_every_s: float = option(1.0, "and while localized, the candidates no more often", low=0.0, high=1e6)
+    search_every_s: float = option(0.25, "the candidates no more often while not localized", low=0.0, high=1e6)
+    look_every_s: float = option(1.0, "and no more often while localized", low=0.0, high=1e6)
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
     follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
@@ -195,6 +196,12 @@ class LocalizerNodeConfig(LocalizerConfig):
     weights: str = option("", "weights file (safetensors); empty = the shipped weights")
     device: Literal["cpu", "cuda"] = option("cpu", "where the encoder runs")
     threads: int = option(0, "CPU threads for a descriptor; 0 = as many as cores, at most four", low=0, high=64)
+    most_waiting: int = option(
+        4,
+        "scans that may wait while one is worked on; where more come, all but the newest are dropped",
+        low=1,
+        high=100,
+    )
     autostart: bool = option(True, "configure and activate without being told by a lifecycle manager")
     global_frame_id: str = option("map", "name of the ENU frame at the map's origin")
     base_frame_id: str = option("base_link", "name of the frame whose position is given")

@@ -10,9 +10,9 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
@@ -35,6 +35,7 @@ from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import (
     EXHAUSTIVE,
     AlignedPoses,
+    BoolArray,
     Candidates,
     Float64Array,
     Hypotheses,
@@ -65,7 +66,7 @@ class Aligner:
         self.aerial_map, self.config = aerial_map, config
         self.model = model or ObservationModel.load()
         self.likelihood = MapLikelihood(aerial_map, self.model)
-        self._threads = min(os.cpu_count() or 1, 4)
+        self.threads = min(os.cpu_count() or 1, 4)
         west, south, east, north = aerial_map.bounds
         self.area_m2 = (east - west) * (north - south)
         self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
@@ -76,14 +77,23 @@ class Aligner:
         small = self.area_m2 <= 1e6 * self.config.exhaustive_km2
         return self.config.search == "exhaustive" or (self.config.search == "auto" and small)
 
-    def is_convincing(self, aligned: AlignedPoses) -> bool:
-        """Whether a pose is believed enough to leave the rest of the map alone."""
-        return bool(len(aligned)) and float(aligned.probabilities.max()) >= self.config.convincing
-
     def warm_up(self) -> None:
         """Read what an exhaustive search needs, so that the first scan does not wait for it."""
         if self.searches_everywhere:
             self.likelihood.prepare()
+
+    def begin(
+        self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Candidates
+    ) -> Alignment | None:
+        """Return the alignment of a scan, which has looked nowhere yet; None for a scan that saw too little.
+
+        `sensor_xy_m`: where the sensor is on the base. The candidates' own shares of belief count wherever the poses
+        come from.
+        """
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
+        if len(evidence) < self.config.min_cells:
+            return None
+        return Alignment(self, evidence, candidates)
 
     def align(
         self,
@@ -95,129 +105,191 @@ class Aligner:
         around: bool = True,
         everywhere: bool = False,
     ) -> AlignedPoses:
-        """Return where the scan fits, best first.
-
-        `sensor_xy_m`: where the sensor is on the base. `around` the candidates' places poses are sought, with
-        `everywhere` on the whole map. Every hypothesis has one pose of its own in the result, as far as it lies on
-        the map. The candidates' own shares of belief count too, wherever the poses come from.
-        """
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
-        if len(evidence) < self.config.min_cells:
+        """Return where the scan fits, best first: `around` the candidates' places, `everywhere`, at the hypotheses."""
+        alignment = self.begin(prepared, sensor_xy_m, candidates)
+        if alignment is None:
             return no_aligned_poses()
-        fine = fine_evidence(evidence)
-        found = self._found(evidence, candidates.grid if around else np.empty((0, 3)), everywhere)
-        followed = self._followed(hypotheses)
-        poses = np.vstack([found.poses, followed])
-        if not len(poses):
-            return no_aligned_poses()
-        some = fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
-        climbed, rested = climb(some, self.likelihood, poses, reach_m=self.config.follow_m)
-        peaks = Peaks(climbed.poses, scores_at(fine, self.likelihood, climbed.poses))
-        source = self._sources(peaks, len(found.poses), candidates.grid)
-        kept = self._kept(peaks, len(found.poses))
-        counts = fine.counts()
-        log_likelihood = self.model.log_likelihood(peaks.scores, counts) + self._retrieved(peaks.poses, candidates)
-        kept = kept[np.argsort(-log_likelihood[kept], kind="stable")]
-        chosen = peaks.poses[kept]
-        covariance = np.array([self._covariance(some, len(fine), pose) for pose in chosen]).reshape(-1, 3, 3)
-        log_odds = log_likelihood[kept] + self.log_prior
-        # A hypothesis and a peak of the search may be one pose: it counts once.
-        log_odds[_repeated(chosen)] = -np.inf
-        return AlignedPoses(
-            grid=self._grid(chosen),
-            heading_rad=np.array([wrapped(float(angle)) for angle in chosen[:, 2]]),
-            covariance=covariance,
-            log_likelihood=log_likelihood[kept],
-            probabilities=np.exp(log_odds - np.logaddexp(0.0, logsumexp(log_odds))),
-            inliers=np.clip(peaks.scores[kept] / max(float(self.model.expected @ counts), 1e-9), 0.0, 1.0),
-            converged=rested[kept],
-            source=source[kept],
-            log_prior=self.log_prior,
-        )
-
-    def _found(self, evidence: Evidence, places: Float64Array, everywhere: bool) -> Peaks:
-        """Return the best peaks around the places (k, 3) and, where asked, of the whole map, on the middle level."""
-        coarse, middle = self.likelihood.levels
-        laid = evidence.coarser(coarse.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
-        sought = []
+        if around:
+            alignment.look_around()
         if everywhere:
-            self.likelihood.prepare()
-            sought.append((inside(self.likelihood, coarse), 2 * self.config.peaks, self._threads))
-        if len(places):
-            self._prepare(places)
-            marked = around(self.likelihood, coarse, self._local(places[:, :2]), self.config.radius_m)
-            sought.append((marked, self.config.peaks, 1))
-        seeds = [
-            search_cells(laid, coarse, cells, COARSE_HEADINGS, most, _APART_M, threads).poses
-            for cells, most, threads in sought
-        ]
-        if not sum(len(poses) for poses in seeds):
-            return Peaks(np.empty((0, 3)), np.empty(0))
-        nearer = local_search(
-            evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES), middle, np.vstack(seeds), 4.0,
-            math.radians(7.5), 2,
-        )  # fmt: skip
-        best = merge(nearer, 4.0, _SAME_RAD)[: len(sought) * self.config.poses]
-        return Peaks(nearer.poses[best], nearer.scores[best])
+            alignment.look_everywhere()
+        if hypotheses is not None:
+            alignment.follow(hypotheses)
+        return alignment.result()
 
-    def _retrieved(self, poses: Float64Array, candidates: Candidates) -> Float64Array:
-        """Return the log likelihood ratios (p,) that the descriptors give: belief near a pose over that by lot."""
-        if not len(candidates):
-            return np.zeros(len(poses))
-        away = np.hypot(*(poses[:, None, :2] - self._local(candidates.grid[:, :2])[None]).transpose(2, 0, 1))
-        believed = (away <= _PLACE_M) @ candidates.probabilities
-        by_lot = min(math.pi * _PLACE_M**2 / self.area_m2, 1.0)
-        return np.asarray(self.config.descriptor_weight * np.log(believed / by_lot + _UNSEEN))
-
-    def _followed(self, hypotheses: Hypotheses | None) -> Float64Array:
-        """Return the hypotheses (h, 3) as poses to begin at; those off the map as NaN are left to the climb."""
-        if hypotheses is None or not len(hypotheses):
-            return np.empty((0, 3))
-        self._prepare(hypotheses.grid)
-        return np.column_stack([self._local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
-
-    def _prepare(self, places: Float64Array) -> None:
+    def prepare(self, places: Float64Array) -> None:
         """Have the map read around places (k, 3); those that are not finite are none."""
         r = self.config.radius_m
         for easting, northing in places[np.isfinite(places[:, :2]).all(axis=1), :2]:
             self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
 
-    def _sources(self, peaks: Peaks, found: int, places: Float64Array) -> Int64Array:
-        """Return where each pose comes from: the nearest candidate, the hypothesis, or everywhere."""
-        source = np.full(len(peaks.scores), EXHAUSTIVE, np.int64)
-        if len(places):
-            away = np.hypot(*(peaks.poses[:found, None, :2] - self._local(places[:, :2])[None]).transpose(2, 0, 1))
-            away[np.isnan(away)] = np.inf
-            near = away.min(axis=1) <= 2.0 * self.config.radius_m
-            source[:found][near] = away.argmin(axis=1)[near]
-        source[found:] = -1 - np.arange(len(source) - found)
-        return source
-
-    def _kept(self, peaks: Peaks, found: int) -> Int64Array:
-        """Return the rows of all hypotheses and of the peaks that are poses of their own."""
-        first = Peaks(peaks.poses[:found], peaks.scores[:found])
-        return np.concatenate([merge(first, _SAME_M, _SAME_RAD), np.arange(found, len(peaks.scores))])
-
-    def _covariance(self, some: Evidence, cells: int, pose: Float64Array) -> Float64Array:
-        """Return the covariance (3, 3) of a pose from the shape of the score around it.
-
-        `some` of the `cells` of the whole evidence stand for all.
-        """
-        scores = scores_at(some, self.likelihood, pose + _SHAPE) * (cells / max(len(some), 1))
-        weights = np.exp((scores - scores.max()) / self.config.shape_temperature)
-        weights /= weights.sum()
-        offsets = _SHAPE - weights @ _SHAPE
-        spread = (offsets * weights[:, None]).T @ offsets
-        return np.asarray(spread + np.diag([_LEAST_STD_M**2, _LEAST_STD_M**2, _LEAST_STD_RAD**2]))
-
-    def _local(self, grid: Float64Array) -> Float64Array:
+    def local(self, grid: Float64Array) -> Float64Array:
+        """Return grid positions (n, 2) in metres from the likelihood's south-west corner."""
         return np.asarray(grid - np.array([self.likelihood.west_m, self.likelihood.south_m]))
 
-    def _grid(self, poses: Float64Array) -> Float64Array:
+    def on_grid(self, poses: Float64Array) -> Float64Array:
         """Return (n, 3) grid positions of poses, on the terrain."""
         easting, northing = poses[:, 0] + self.likelihood.west_m, poses[:, 1] + self.likelihood.south_m
         heights = [self.likelihood.terrain_height(float(e), float(n)) for e, n in zip(easting, northing, strict=True)]
         return np.column_stack([easting, northing, heights])
+
+
+class Alignment:
+    """The alignment of one scan, look by look: what one look found is known to the next."""
+
+    def __init__(self, aligner: Aligner, evidence: Evidence, candidates: Candidates) -> None:
+        """Look nowhere yet."""
+        self._aligner, self._config, self._threads = aligner, aligner.config, aligner.threads
+        self._likelihood = aligner.likelihood
+        self._evidence, self._candidates = evidence, candidates
+        self._places = aligner.local(candidates.grid[:, :2])
+        self._fine = fine_evidence(evidence)
+        self._some = self._fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
+        self._nearer, self._is_climbed = _no_peaks(), np.empty(0, np.bool_)
+        self._looks = 0
+        self._found, self._followed = _no_climbed(), _no_climbed()
+
+    def look_around(self) -> None:
+        """Seek poses around the candidates' places."""
+        if not len(self._places):
+            return
+        self._aligner.prepare(self._candidates.grid)
+        coarse = self._likelihood.levels[0]
+        self._look(around(self._likelihood, coarse, self._places, self._config.radius_m), self._config.peaks)
+
+    def look_everywhere(self) -> None:
+        """Seek poses on the whole map."""
+        self._likelihood.prepare()
+        self._look(inside(self._likelihood, self._likelihood.levels[0]), 2 * self._config.peaks)
+
+    def follow(self, hypotheses: Hypotheses) -> None:
+        """Seek one pose for each hypothesis; those off the map as NaN are left to the climb."""
+        if len(hypotheses):
+            self._aligner.prepare(hypotheses.grid)
+            poses = np.column_stack([self._aligner.local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
+            self._followed = self._climbed(poses, -1 - np.arange(len(poses)))
+
+    def is_convincing(self) -> bool:
+        """Whether a pose is believed enough to leave the rest of the map alone."""
+        probabilities = self._weighed()[2]
+        return bool(len(probabilities)) and float(probabilities.max()) >= self._config.convincing
+
+    def result(self) -> AlignedPoses:
+        """Return where the scan fits, best first.
+
+        Every hypothesis has one pose of its own in the result, as far as it lies on the map.
+        """
+        climbed, log_likelihood, probabilities = self._weighed()
+        if not len(climbed.poses):
+            return no_aligned_poses()
+        expected = max(float(self._aligner.model.expected @ self._fine.counts()), 1e-9)
+        return AlignedPoses(
+            grid=self._aligner.on_grid(climbed.poses),
+            heading_rad=np.array([wrapped(float(angle)) for angle in climbed.poses[:, 2]]),
+            covariance=self._covariances(climbed.poses),
+            log_likelihood=log_likelihood,
+            probabilities=probabilities,
+            inliers=np.clip(climbed.scores / expected, 0.0, 1.0),
+            converged=climbed.rested,
+            source=climbed.source,
+            log_prior=self._aligner.log_prior,
+        )
+
+    def _look(self, runs: Int64Array, most: int) -> None:
+        """Seek poses in the runs of coarse cells, and climb from the best of all looks that were not climbed from."""
+        coarse, middle = self._likelihood.levels
+        laid = self._evidence.coarser(coarse.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
+        seeds = search_cells(laid, coarse, runs, COARSE_HEADINGS, most, _APART_M, self._threads)
+        if not len(seeds.poses):
+            return
+        finer = self._evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES)
+        nearer = local_search(finer, middle, seeds.poses, 4.0, math.radians(7.5), 2, self._threads)
+        self._nearer = Peaks(*map(np.concatenate, zip(vars(self._nearer).values(), vars(nearer).values(), strict=True)))
+        self._is_climbed = np.append(self._is_climbed, np.zeros(len(nearer.scores), np.bool_))
+        self._looks += 1
+        best = merge(self._nearer, 4.0, _SAME_RAD)[: self._looks * self._config.poses]
+        fresh = best[~self._is_climbed[best]]
+        self._is_climbed[fresh] = True
+        self._found = self._found.join(self._climbed(self._nearer.poses[fresh], None))
+
+    def _climbed(self, poses: Float64Array, source: Int64Array | None) -> _Climbed:
+        """Return where the climb from poses (p, 3) ends, and whether candidates lie there where no source is given."""
+        peaks, rested = climb(self._some, self._likelihood, poses, reach_m=self._config.follow_m, threads=self._threads)
+        scores = scores_at(self._fine, self._likelihood, peaks.poses, self._threads)
+        if source is None:
+            source = np.full(len(poses), EXHAUSTIVE, np.int64)
+            if len(self._places):
+                away = self._away(peaks.poses)
+                near = away.min(axis=1) <= 2.0 * self._config.radius_m
+                source[near] = away.argmin(axis=1)[near]
+        return _Climbed(peaks.poses, scores, rested, source)
+
+    def _weighed(self) -> tuple[_Climbed, Float64Array, Float64Array]:
+        """Return the poses that are kept, best first, with log likelihoods and probabilities."""
+        found = self._found.take(merge(Peaks(self._found.poses, self._found.scores), _SAME_M, _SAME_RAD))
+        climbed = found.join(self._followed)
+        log_likelihood = self._aligner.model.log_likelihood(climbed.scores, self._fine.counts())
+        log_likelihood = log_likelihood + self._retrieved(climbed.poses)
+        order = np.argsort(-log_likelihood, kind="stable")
+        climbed, log_likelihood = climbed.take(order), log_likelihood[order]
+        log_odds = log_likelihood + self._aligner.log_prior
+        # A hypothesis and a peak of the search may be one pose: it counts once.
+        near = are_near(climbed.poses, _SAME_M, _SAME_RAD)
+        log_odds[np.tril(near, -1).any(axis=1)] = -np.inf
+        return climbed, log_likelihood, np.exp(log_odds - np.logaddexp(0.0, np.logaddexp.reduce(log_odds)))
+
+    def _retrieved(self, poses: Float64Array) -> Float64Array:
+        """Return the log likelihood ratios (p,) that the descriptors give: belief near a pose over that by lot."""
+        if not len(self._places):
+            return np.zeros(len(poses))
+        believed = (self._away(poses) <= _PLACE_M) @ self._candidates.probabilities
+        by_lot = min(math.pi * _PLACE_M**2 / self._aligner.area_m2, 1.0)
+        return np.asarray(self._config.descriptor_weight * np.log(believed / by_lot + _UNSEEN))
+
+    def _away(self, poses: Float64Array) -> Float64Array:
+        """Return distances (p, k) of poses from the candidates' places; infinite where either is none."""
+        away = np.hypot(*(poses[:, None, :2] - self._places[None]).transpose(2, 0, 1))
+        return np.where(np.isnan(away), np.inf, away)
+
+    def _covariances(self, poses: Float64Array) -> Float64Array:
+        """Return the covariances (p, 3, 3) of poses from the shape of the score around them."""
+        around_them = (poses[:, None] + _SHAPE).reshape(-1, 3)
+        scores = scores_at(self._some, self._likelihood, around_them, self._threads).reshape(len(poses), -1)
+        scores *= len(self._fine) / max(len(self._some), 1)  # some of the cells stand for all
+        weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.shape_temperature)
+        weights /= weights.sum(axis=1, keepdims=True)
+        offsets = _SHAPE - (weights @ _SHAPE)[:, None]
+        spread = np.einsum("ps,psi,psj->pij", weights, offsets, offsets)
+        return np.asarray(spread + np.diag([_LEAST_STD_M**2, _LEAST_STD_M**2, _LEAST_STD_RAD**2]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Climbed:
+    """Where climbs ended."""
+
+    poses: Float64Array
+    """(p, 3) local metres, radians."""
+    scores: Float64Array
+    """(p,) nats, of the fine evidence."""
+    rested: BoolArray
+    """(p,) whether the climb came to rest near where it began."""
+    source: Int64Array
+    """(p,) as `AlignedPoses` has it."""
+
+    def take(self, rows: Int64Array) -> _Climbed:
+        return _Climbed(*(values[rows] for values in vars(self).values()))
+
+    def join(self, other: _Climbed) -> _Climbed:
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Climbed(*(np.concatenate(pair) for pair in pairs))
+
+
+def _no_peaks() -> Peaks:
+    return Peaks(np.empty((0, 3)), np.empty(0))
+
+
+def _no_climbed() -> _Climbed:
+    return _Climbed(np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_), np.empty(0, np.int64))
 
 
 def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int64Array:
@@ -238,10 +310,3 @@ def moved(aligned: AlignedPoses, step: Float64Array) -> AlignedPoses:
     grid[:, 1] += s * step[0] + c * step[1]
     heading = np.array([wrapped(float(angle)) for angle in aligned.heading_rad + step[2]])
     return dataclasses.replace(aligned, grid=grid, heading_rad=heading)
-
-
-def _repeated(poses: Float64Array) -> np.ndarray:
-    """Mark the poses (n, 3), best first, that are the same as a better one."""
-    return np.array(
-        [any(are_near(poses[i], poses[j], _SAME_M, _SAME_RAD) for j in range(i)) for i in range(len(poses))], np.bool_
-    )

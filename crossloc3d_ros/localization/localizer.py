@@ -8,7 +8,7 @@ import numpy as np
 
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
-from crossloc3d_ros.config import LocalizerConfig
+from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment import Aligner, moved
 from crossloc3d_ros.localization.credibility import effective_calibration, judge
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
@@ -25,6 +25,7 @@ from crossloc3d_ros.types import (
     Hypotheses,
     Scan,
     TrackState,
+    no_aligned_poses,
 )
 
 __all__ = ["Localizer", "no_estimate"]
@@ -41,7 +42,7 @@ class Localizer:
         self.calibration = effective_calibration(config.credibility, encoder)
         self._aligner = None if config.alignment.search == "off" else Aligner(aerial_map, config.alignment)
         self._tracker = Tracker(config.fusion)
-        self._looks = Looks(config.alignment.look_every_s, config.alignment.exhaustive_every_s)
+        self._looks = Looks(config.alignment)
 
     @property
     def stamp_ns(self) -> int | None:
@@ -136,17 +137,19 @@ class Localizer:
         found: Candidates,
         hypotheses: Hypotheses,
     ) -> AlignedPoses:
-        """Align around the hypotheses, and as often as is due around the candidates and everywhere."""
+        """Align at the hypotheses, and as often as is due around the candidates and everywhere."""
         config, looks = self.config.alignment, self._looks
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        candidates = _first(found, config.candidates)
-        around = looks.around(stamp_ns) and config.search != "exhaustive"
-        aligned = aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around)
-        if not aligner.searches_everywhere or (config.search == "auto" and aligner.is_convincing(aligned)):
-            return aligned
-        if not looks.everywhere(stamp_ns):
-            return aligned
-        return aligner.align(prepared, sensor_xy, candidates, hypotheses, around=around, everywhere=True)
+        alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
+        if alignment is None:
+            return no_aligned_poses()
+        alignment.follow(hypotheses)
+        if looks.around(stamp_ns) and config.search != "exhaustive":
+            alignment.look_around()
+        is_enough = config.search == "auto" and alignment.is_convincing()
+        if aligner.searches_everywhere and not is_enough and looks.everywhere(stamp_ns):
+            alignment.look_everywhere()
+        return alignment.result()
 
     def _within_turn(self, stamp_ns: int, motion: Motion | None) -> Float64Array:
         """Return the way (3,) from the middle of the lidar's turn, of which the scan tells, to its stamp."""
@@ -158,28 +161,29 @@ class Localizer:
 
 
 class Looks:
-    """When to look beyond the hypotheses: at every scan while the place is not known, now and then when it is."""
+    """When to look beyond the hypotheses: at once where nothing is known, now and then afterwards."""
 
-    def __init__(self, around_every_s: float, everywhere_every_s: float) -> None:
-        self._every_ns = (round(around_every_s * 1e9), round(everywhere_every_s * 1e9))
+    def __init__(self, config: AlignmentConfig) -> None:
+        self._config = config
         self.reset()
 
     def reset(self) -> None:
         """Look at the next scan."""
         self.state = TrackState.SEARCHING
-        self._last_ns: list[int | None] = [None, None]
+        self._last_ns: dict[str, int] = {}
 
     def around(self, stamp_ns: int) -> bool:
         """Return whether the candidates' surroundings are due; then they are taken as looked at."""
-        return self._due(0, stamp_ns, self.state is not TrackState.LOCALIZED)
+        is_localized = self.state is TrackState.LOCALIZED
+        return self._due("around", stamp_ns, self._config.look_every_s if is_localized else self._config.search_every_s)
 
     def everywhere(self, stamp_ns: int) -> bool:
         """Return whether the whole map is due; then it is taken as looked at."""
-        return self._due(1, stamp_ns, False)
+        return self._due("everywhere", stamp_ns, self._config.exhaustive_every_s)
 
-    def _due(self, which: int, stamp_ns: int, always: bool) -> bool:
-        last = self._last_ns[which]
-        due = always or last is None or not 0 <= stamp_ns - last < self._every_ns[which]
+    def _due(self, which: str, stamp_ns: int, every_s: float) -> bool:
+        last_ns = self._last_ns.get(which)
+        due = last_ns is None or not 0 <= stamp_ns - last_ns < round(every_s * 1e9)
         if due:
             self._last_ns[which] = stamp_ns
         return due

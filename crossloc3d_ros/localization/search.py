@@ -8,8 +8,10 @@ poses at once; what scores best is looked at again on the next level, and at las
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -33,14 +35,14 @@ class Peaks:
 
 
 def search_cells(
-    evidence: Evidence, level: Level, cells: BoolArray, headings: int, most: int, apart_m: float, threads: int = 1
+    evidence: Evidence, level: Level, runs: Int64Array, headings: int, most: int, apart_m: float, threads: int = 1
 ) -> Peaks:
-    """Return the best poses with the base in one of the marked cells (H, W) of a level, at least `apart_m` apart.
+    """Return the best poses with the base in one of the cells of a level that `runs` names, at least `apart_m` apart.
 
-    `evidence` is in cells of the level, its passages in blocks of 2 x 2. Marked cells must be so far from the edge of
-    the level that the evidence stays inside. A cell has one heading, its best of `headings` evenly over the circle.
+    `runs` (R, 3): row, first column and length of stretches of cells, as `around` and `inside` give them; so far from
+    the edge of the level that the evidence stays inside. `evidence` is in cells of the level, its passages in blocks
+    of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
     """
-    runs = _runs(cells)
     if not len(runs) or not len(evidence):
         return Peaks(np.empty((0, 3)), np.empty(0))
     angles = 2.0 * math.pi * np.arange(headings) / headings
@@ -70,56 +72,68 @@ def search_cells(
 
 
 def climb(
-    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, *, reach_m: float, steps: int = len(_STEPS)
+    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, *, reach_m: float, threads: int = 1
 ) -> tuple[Peaks, BoolArray]:
     """Climb from each pose (p, 3) to the best one around it in the fine cells, in smaller and smaller steps.
 
-    Returns the poses in their order and whether each came to rest within `reach_m` of where it began. `steps`: how
-    many of the step sizes are taken, from 1 m and 2 degrees on.
+    Returns the poses in their order and whether each came to rest within `reach_m` of where it began.
     """
-    found, scores, rested = _climb(
-        likelihood.classes, likelihood.model.log_ratios, np.ascontiguousarray(evidence.xy_m), evidence.channel,
-        np.ascontiguousarray(poses, np.float64), reach_m, np.array(_STEPS[:steps]), _MOVES, CELL_M,
-    )  # fmt: skip
+    xy, steps = np.ascontiguousarray(evidence.xy_m), np.array(_STEPS)
+
+    def part(some: Float64Array) -> tuple[Float64Array, Float64Array, BoolArray]:
+        found: tuple[Float64Array, Float64Array, BoolArray] = _climb(
+            likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, reach_m, steps, _MOVES, CELL_M
+        )
+        return found
+
+    found, scores, rested = _in_parts(part, poses, threads)
     return Peaks(found, scores), rested
 
 
-def scores_at(evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array) -> Float64Array:
+def scores_at(evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, threads: int = 1) -> Float64Array:
     """Return the scores (p,) of poses (p, 3) in the fine cells, nats."""
-    scores: Float64Array = _scores(
-        likelihood.classes, likelihood.model.log_ratios, np.ascontiguousarray(evidence.xy_m), evidence.channel,
-        np.ascontiguousarray(poses, np.float64), CELL_M,
-    )  # fmt: skip
-    return scores
+    xy = np.ascontiguousarray(evidence.xy_m)
+
+    def part(some: Float64Array) -> tuple[Float64Array]:
+        return (_scores(likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, CELL_M),)
+
+    return np.asarray(_in_parts(part, poses, threads)[0])
 
 
 def local_search(
-    evidence: Evidence, level: Level, poses: Float64Array, reach_m: float, turn_rad: float, turns: int
+    evidence: Evidence, level: Level, poses: Float64Array, reach_m: float, turn_rad: float, turns: int, threads: int = 1
 ) -> Peaks:
     """Return the best pose within `reach_m` and `turn_rad` of each pose (p, 3), on the grid of a level, in their order.
 
     `turns` steps of the heading to either side.
     """
-    found, scores = _local(
-        level.ratios, np.ascontiguousarray(evidence.xy_m), evidence.channel, level.cell_m,
-        np.ascontiguousarray(poses, np.float64), round(reach_m / level.cell_m), turn_rad / max(turns, 1), turns, LAYERS,
-    )  # fmt: skip
+    xy, reach = np.ascontiguousarray(evidence.xy_m), round(reach_m / level.cell_m)
+
+    def part(some: Float64Array) -> tuple[Float64Array, Float64Array]:
+        found: tuple[Float64Array, Float64Array] = _local(
+            level.ratios, xy, evidence.channel, level.cell_m, some, reach, turn_rad / max(turns, 1), turns, LAYERS
+        )
+        return found
+
+    found, scores = _in_parts(part, poses, threads)
     return Peaks(found, scores / QUANTA)
 
 
 def merge(peaks: Peaks, apart_m: float, apart_rad: float) -> Int64Array:
     """Return which peaks to keep, best first: one of those nearer than both to a better one."""
+    near = are_near(peaks.poses, apart_m, apart_rad)
     kept: list[int] = []
     for i in np.argsort(-peaks.scores, kind="stable"):
-        if not any(are_near(peaks.poses[i], peaks.poses[j], apart_m, apart_rad) for j in kept):
+        if not near[i, kept].any():
             kept.append(int(i))
     return np.array(kept, np.int64)
 
 
-def are_near(first: Float64Array, second: Float64Array, apart_m: float, apart_rad: float) -> bool:
-    """Return whether two poses (3,) are nearer to each other than both bounds."""
-    turned = abs(wrapped(float(first[2] - second[2])))
-    return math.hypot(*(first[:2] - second[:2])) < apart_m and turned < apart_rad
+def are_near(poses: Float64Array, apart_m: float, apart_rad: float) -> BoolArray:
+    """Mark the pairs (n, n) of poses (n, 3) that are nearer to each other than both bounds."""
+    off = poses[:, None] - poses[None]
+    turned = np.abs((off[..., 2] + math.pi) % (2.0 * math.pi) - math.pi)
+    return np.asarray((np.hypot(off[..., 0], off[..., 1]) < apart_m) & (turned < apart_rad))
 
 
 def wrapped(angle: float) -> float:
@@ -127,34 +141,53 @@ def wrapped(angle: float) -> float:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
-def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius_m: float) -> BoolArray:
-    """Mark the cells (H, W) of a level within `radius_m` of any place (k, 2), metres from the south-west corner."""
-    marked = np.zeros(level.ratios.shape[1:], np.bool_)
-    reach = math.ceil(radius_m / level.cell_m)
-    for x, y in places[np.isfinite(places).all(axis=1)]:
-        row, column = int(y / level.cell_m), int(x / level.cell_m)
-        low_r, low_c = max(row - reach, 0), max(column - reach, 0)
-        window = marked[low_r : row + reach + 1, low_c : column + reach + 1]
-        rows, columns = np.ogrid[low_r : low_r + window.shape[0], low_c : low_c + window.shape[1]]
-        away = ((rows + 0.5) * level.cell_m - y) ** 2 + ((columns + 0.5) * level.cell_m - x) ** 2
-        window |= away <= radius_m**2
-    return marked & inside(likelihood, level)
+def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius_m: float) -> Int64Array:
+    """Return the runs (R, 3) of a level's cells on the map within `radius_m` of any place (k, 2), local metres."""
+    whole = inside(likelihood, level)
+    places = places[np.isfinite(places).all(axis=1)]
+    if not len(whole) or not len(places):
+        return np.empty((0, 3), np.int64)
+    # Far outside nothing is near; clipped, it fits into whole numbers.
+    side = level.cell_m * max(level.ratios.shape[1:])
+    x, y = np.clip(places, -side - radius_m, 2.0 * side + radius_m).T / level.cell_m - 0.5
+    reach = radius_m / level.cell_m
+    rows = np.floor(y)[:, None] + np.arange(-math.ceil(reach), math.ceil(reach) + 2)
+    half2 = reach**2 - (rows - y[:, None]) ** 2
+    half = np.sqrt(np.maximum(half2, 0.0))
+    first = np.maximum(np.ceil(x[:, None] - half), whole[0, 1])
+    last = np.minimum(np.floor(x[:, None] + half), whole[0, 1] + whole[0, 2] - 1)
+    some = (half2 >= 0.0) & (last >= first) & (rows >= whole[0, 0]) & (rows <= whole[-1, 0])
+    # In one long line, row after row, the stretches are joined where they touch or lap over.
+    columns = level.ratios.shape[2]
+    starts, ends = (rows[some] * columns + first[some]).astype(np.int64), (rows[some] * columns + last[some] + 1)
+    order = np.argsort(starts, kind="stable")
+    starts, ends = starts[order], np.maximum.accumulate(ends[order].astype(np.int64))
+    new = np.ones(len(starts), np.bool_)
+    new[1:] = (starts[1:] > ends[:-1]) | (starts[1:] // columns != starts[:-1] // columns)
+    starts, ends = starts[new], ends[np.append(np.flatnonzero(new)[1:] - 1, len(ends) - 1)] if len(ends) else ends
+    return np.column_stack([starts // columns, starts % columns, ends - starts])
 
 
-def inside(likelihood: MapLikelihood, level: Level) -> BoolArray:
-    """Mark the cells (H, W) of a level whose middles lie on the map."""
+def inside(likelihood: MapLikelihood, level: Level) -> Int64Array:
+    """Return the runs (R, 3) of a level's cells whose middles lie on the map: one for each row."""
     west, south, east, north = likelihood.aerial_map.bounds
     rows, columns = level.ratios.shape[1:]
     x = likelihood.west_m + (np.arange(columns) + 0.5) * level.cell_m
     y = likelihood.south_m + (np.arange(rows) + 0.5) * level.cell_m
-    return ((y > south) & (y < north))[:, None] & ((x > west) & (x < east))[None, :]
+    across, along = np.flatnonzero((x > west) & (x < east)), np.flatnonzero((y > south) & (y < north))
+    if not len(across):
+        return np.empty((0, 3), np.int64)
+    return np.column_stack([along, np.full(len(along), across[0]), np.full(len(along), len(across))])
 
 
-def _runs(cells: BoolArray) -> Int64Array:
-    """Return row, first column and length (R, 3) of the runs of marked cells."""
-    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    starts, ends = np.argwhere(edges == 1), np.argwhere(edges == -1)
-    return np.column_stack([starts, ends[:, 1] - starts[:, 1]]).astype(np.int64)
+def _in_parts(work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, threads: int) -> tuple[Any, ...]:
+    """Return what `work` gives for poses (p, 3), done by some threads: arrays of p rows."""
+    poses = np.ascontiguousarray(poses, np.float64)
+    parts = np.array_split(poses, max(min(threads, len(poses)), 1))
+    if len(parts) == 1:
+        return work(poses)
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return tuple(np.concatenate(results) for results in zip(*pool.map(work, parts), strict=True))
 
 
 def _apart(ways: Float64Array, scores: Float64Array, most: int, apart_m: float) -> Int64Array:

@@ -67,11 +67,11 @@ from crossloc3d_ros.ros.diagnostics import (
     judge_health,
     snapshot_values,
 )
-from crossloc3d_ros.ros.newest import NewestWorker
 from crossloc3d_ros.ros.odometry_input import OdometryInput, odometry_complaint
 from crossloc3d_ros.ros.parameters import ConfigParameters
 from crossloc3d_ros.ros.poses import EARTH_FRAME_ID, heading_prior, initial_pose, stamp_of
 from crossloc3d_ros.ros.transforms import MapTransform, TransformSource
+from crossloc3d_ros.ros.worker import Worker
 from crossloc3d_ros.types import Estimate, FixStatus, Float64Array, Scan, TrackState
 
 ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -123,7 +123,7 @@ class HeadingSample(NamedTuple):
 
 
 class LocalizerNode(LifecycleNode):
-    """Subscribe to clouds, localize the newest, publish the fix and what led to it."""
+    """Subscribe to clouds, localize them, publish the fix and what led to it."""
 
     def __init__(self, load: Callable[[LocalizerNodeConfig], Localizer] = load_localizer) -> None:
         """Declare the parameters; `load` makes the localizer at configuration. Raises ConfigError."""
@@ -149,7 +149,7 @@ class LocalizerNode(LifecycleNode):
         """What the worker does before the next scan, given its stamp: nobody else touches the hypotheses."""
         self._initial_pose = ""
         self._initial_pose_timer: Any = None
-        self._worker = NewestWorker(self._process, "localize")
+        self._worker = Worker(self._process, "localize", self._config.most_waiting)
         self._statistics = Statistics()
         self._complaint = ""
         self._last_status: FixStatus | None = None
@@ -367,8 +367,7 @@ class LocalizerNode(LifecycleNode):
 
     def _receive(self, message: PointCloud2) -> None:
         self._statistics.received()
-        if self._worker.offer(Arrival(message, time.monotonic())):
-            self._statistics.dropped()
+        self._statistics.dropped(self._worker.offer(Arrival(message, time.monotonic())))
 
     def _receive_odometry(self, message: Odometry) -> None:
         if self._odometry is None:
@@ -475,8 +474,7 @@ class LocalizerNode(LifecycleNode):
 
     def _reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
         """Forget everything that earlier messages left behind."""
-        if self._worker.discard():
-            self._statistics.dropped()
+        self._statistics.dropped(self._worker.discard())
         self._gravity.reset()
         self._forget()
         self.get_logger().info("localizing anew")

@@ -117,7 +117,7 @@ def test_the_whole_map_is_searched_with_the_same_result(aligner: Aligner, scan: 
     assert (everywhere.source == EXHAUSTIVE).all()
     np.testing.assert_allclose(everywhere.grid[0], near.grid[0], atol=0.3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(aligner, "_threads", 1 if aligner._threads > 1 else 2)
+        patch.setattr(aligner, "threads", 1 if aligner.threads > 1 else 2)
         again = aligner.align(scan, BASE, no_candidates(), everywhere=True)
     np.testing.assert_array_equal(again.grid, everywhere.grid)
     np.testing.assert_array_equal(again.probabilities, everywhere.probabilities)

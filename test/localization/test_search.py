@@ -64,13 +64,30 @@ def laid(evidence: Evidence, level: Level, x: float, y: float, angle: float) -> 
     )
 
 
+def runs_of(cells: np.ndarray) -> np.ndarray:
+    """Return row, first column and length (R, 3) of the stretches of marked cells."""
+    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    starts, ends = np.argwhere(edges == 1), np.argwhere(edges == -1)
+    return np.column_stack([starts, ends[:, 1] - starts[:, 1]])
+
+
+def cells_of(runs: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the cells that runs name, after a look that none is named twice."""
+    cells = np.zeros(shape, np.int64)
+    for row, column, count in runs:
+        assert count > 0 and column >= 0 and column + count <= shape[1]
+        cells[row, column : column + count] += 1
+    assert cells.max(initial=0) <= 1
+    return cells > 0
+
+
 @pytest.mark.parametrize("cell_m", [1.0, 4.0])
 @pytest.mark.parametrize("headings", [1, 7])
 def test_the_search_of_cells_finds_what_trying_all_poses_finds(cell_m: float, headings: int) -> None:
     level, evidence = some_level(cell_m), some_evidence(cell_m)
     cells = np.zeros(SHAPE, np.bool_)
     cells[13:21, 14:24] = np.random.default_rng(3).random((8, 10)) < 0.7
-    found = search_cells(evidence, level, cells, headings, 10**4, 0.1 * cell_m)
+    found = search_cells(evidence, level, runs_of(cells), headings, 10**4, 0.1 * cell_m)
     table = {}
     for row, column in np.argwhere(cells):
         x, y = (column + 0.5) * cell_m, (row + 0.5) * cell_m
@@ -88,8 +105,8 @@ def test_peaks_are_apart_and_no_better_one_is_left_out() -> None:
     level, evidence = some_level(4.0), some_evidence(4.0)
     cells = np.zeros(SHAPE, np.bool_)
     cells[12:28, 12:34] = True
-    every = search_cells(evidence, level, cells, 6, 10**4, 0.1)
-    few = search_cells(evidence, level, cells, 6, 5, 11.0)
+    every = search_cells(evidence, level, runs_of(cells), 6, 10**4, 0.1)
+    few = search_cells(evidence, level, runs_of(cells), 6, 5, 11.0)
     chosen: list[np.ndarray] = []
     for pose in every.poses:
         if all(np.hypot(*(pose[:2] - other[:2])) >= 11.0 for other in chosen):
@@ -103,16 +120,34 @@ def test_threads_change_nothing(threads: int) -> None:
     level.ratios[:] = np.clip(level.ratios, -1, 1)  # many headings are equally good
     evidence, cells = some_evidence(2.0, 12), np.ones(SHAPE, np.bool_)
     cells[:12] = cells[-12:] = cells[:, :12] = cells[:, -12:] = False
-    one, many = (search_cells(evidence, level, cells, 11, 50, 3.0, count) for count in (1, threads))
+    one, many = (search_cells(evidence, level, runs_of(cells), 11, 50, 3.0, count) for count in (1, threads))
     np.testing.assert_array_equal(one.poses, many.poses)
     np.testing.assert_array_equal(one.scores, many.scores)
+
+
+@pytest.mark.parametrize("threads", [2, 5, 64])
+def test_threads_share_poses_and_keep_their_order(likelihood: MapLikelihood, box_town: Any, threads: int) -> None:
+    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).some(100, 100)
+    rng = np.random.default_rng(6)
+    poses = np.column_stack([rng.uniform(200, 300, (23, 2)), rng.uniform(-3, 3, 23)])
+    level = likelihood.levels[1]
+    for few in (poses, poses[:1], poses[:0]):
+        one, many = (local_search(evidence.coarser(2.0, 90, 90), level, few, 4.0, 0.1, 2, n) for n in (1, threads))
+        np.testing.assert_array_equal(one.poses, many.poses)
+        np.testing.assert_array_equal(one.scores, many.scores)
+        (one, rested), (many, all_rested) = (
+            climb(evidence, likelihood, few, reach_m=3.0, threads=n) for n in (1, threads)
+        )
+        np.testing.assert_array_equal(one.poses, many.poses)
+        np.testing.assert_array_equal(rested, all_rested)
+        np.testing.assert_array_equal(one.scores, scores_at(evidence, likelihood, one.poses, threads))
 
 
 def test_nothing_marked_and_nothing_seen_find_nothing() -> None:
     level, cells = some_level(2.0), np.ones(SHAPE, np.bool_)
     nothing = Evidence(np.empty((0, 2)), np.empty(0, np.int64))
-    assert len(search_cells(some_evidence(2.0), level, np.zeros_like(cells), 6, 5, 4.0).scores) == 0
-    assert len(search_cells(nothing, level, cells, 6, 5, 4.0).scores) == 0
+    assert len(search_cells(some_evidence(2.0), level, runs_of(np.zeros_like(cells)), 6, 5, 4.0).scores) == 0
+    assert len(search_cells(nothing, level, runs_of(cells), 6, 5, 4.0).scores) == 0
     assert len(local_search(some_evidence(2.0), level, np.empty((0, 3)), 4.0, 0.1, 2).scores) == 0
 
 
@@ -144,11 +179,16 @@ def test_marked_cells_are_those_near_places_and_on_the_map(likelihood: MapLikeli
     rows, columns = np.indices(level.ratios.shape[1:])
     x, y = (columns + 0.5) * level.cell_m, (rows + 0.5) * level.cell_m
     on_map = (x > 112) & (x < 112 + 280) & (y > 112) & (y < 112 + 280)
-    np.testing.assert_array_equal(inside(likelihood, level), on_map)
+    np.testing.assert_array_equal(cells_of(inside(likelihood, level), rows.shape), on_map)
     places = np.array([[150.0, 160.0], [161.0, 170.0], [113.0, 390.0], [-500.0, 200.0], [1e7, -1e7], [np.nan, 200.0]])
-    near = np.any([np.hypot(x - a, y - b) <= 22.0 for a, b in places], axis=0)
-    np.testing.assert_array_equal(around(likelihood, level, places, 22.0), near & on_map)
-    assert not around(likelihood, level, np.empty((0, 2)), 22.0).any()
+    rng = np.random.default_rng(0)
+    for some in (places, *(rng.uniform(60.0, 440.0, (count, 2)) for count in (1, 3, 30, 300))):
+        near = np.any([np.hypot(x - a, y - b) <= 22.0 for a, b in some], axis=0)
+        found = around(likelihood, level, some, 22.0)
+        np.testing.assert_array_equal(cells_of(found, rows.shape), near & on_map)
+        np.testing.assert_array_equal(found, runs_of(near & on_map), err_msg="as few and as long as can be")
+    for none in (np.empty((0, 2)), np.full((2, 2), np.nan), np.array([[1e12, 0.0], [-1e300, 1e300]])):
+        assert len(around(likelihood, level, none, 22.0)) == 0
 
 
 def test_the_climb_never_descends_and_says_how_far_it_went(likelihood: MapLikelihood, box_town: Any) -> None:
@@ -227,8 +267,10 @@ def test_levels_agree_on_where_a_pose_is(likelihood: MapLikelihood, box_town: An
     """What the search of cells scores at a cell's middle, the local search scores there, too."""
     level = likelihood.levels[which]
     evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3, (0.21, -0.13)).coarser(level.cell_m, 100, 100)
-    cells = inside(likelihood, level) & (np.random.default_rng(1).random(level.ratios.shape[1:]) < 0.02)
-    peaks = search_cells(evidence, level, cells, 23, 10**4, 0.1)
+    cells = cells_of(inside(likelihood, level), level.ratios.shape[1:]) & (
+        np.random.default_rng(1).random(level.ratios.shape[1:]) < 0.02
+    )
+    peaks = search_cells(evidence, level, runs_of(cells), 23, 10**4, 0.1)
     assert len(peaks.poses) == cells.sum()
     off_axis = peaks.poses[:, 2] != 0.0  # else all evidence lies on the borders of cells
     here = local_search(evidence, level, peaks.poses, 0.0, 0.0, 0).scores

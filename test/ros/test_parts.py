@@ -28,9 +28,9 @@ from crossloc3d_ros.errors import CloudError, ConfigError
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.ros.conversions import matrix_from_transform, stamp_message
 from crossloc3d_ros.ros.diagnostics import Outcome, Statistics, judge_health
-from crossloc3d_ros.ros.newest import NewestWorker
 from crossloc3d_ros.ros.shared_memory import PROFILES_VARIABLE, SEGMENT_BYTES, prepare_for_large_clouds
 from crossloc3d_ros.ros.transforms import TransformSource
+from crossloc3d_ros.ros.worker import Worker
 from crossloc3d_ros.types import FixStatus
 
 # The worker
@@ -53,12 +53,11 @@ def test_only_the_newest_of_those_that_wait_is_worked_on(gate: threading.Event) 
         gate.wait(10)
         done.append(item)
 
-    worker = NewestWorker(work, "test")
+    worker = Worker(work, "test")
     worker.start(lambda: None)
-    assert not worker.offer(0)
+    assert worker.offer(0) == 0
     assert begun.wait(5)
-    pushed_out = [worker.offer(i) for i in range(1, 6)]
-    assert pushed_out == [False, True, True, True, True]
+    assert [worker.offer(i) for i in range(1, 6)] == [0, 1, 1, 1, 1]
     gate.set()
     deadline = time.monotonic() + 5
     while len(done) < 2 and time.monotonic() < deadline:
@@ -67,9 +66,34 @@ def test_only_the_newest_of_those_that_wait_is_worked_on(gate: threading.Event) 
     assert done == [0, 5]
 
 
+def test_a_few_may_wait_and_are_worked_on_in_their_order(gate: threading.Event) -> None:
+    done: list[int] = []
+    begun = threading.Event()
+
+    def work(item: int) -> None:
+        begun.set()
+        gate.wait(10)
+        done.append(item)
+
+    worker = Worker(work, "test", most_waiting=3)
+    worker.start(lambda: None)
+    worker.offer(0)
+    assert begun.wait(5)
+    assert [worker.offer(i) for i in range(1, 4)] == [0, 0, 0]
+    assert worker.offer(4) == 3, "more than may wait: the newest alone counts"
+    assert [worker.offer(i) for i in (5, 6)] == [0, 0]
+    gate.set()
+    deadline = time.monotonic() + 5
+    while len(done) < 4 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert worker.discard() == 0
+    assert worker.stop()
+    assert done == [0, 4, 5, 6]
+
+
 def test_preparation_runs_in_the_workers_thread_and_its_error_comes_back() -> None:
     threads = []
-    worker = NewestWorker(lambda item: threads.append(threading.current_thread().name), "localize")
+    worker = Worker(lambda item: threads.append(threading.current_thread().name), "localize")
     worker.start(lambda: threads.append(threading.current_thread().name))
     assert threads == ["localize"]
     assert worker.stop()
@@ -93,7 +117,7 @@ def test_a_worker_that_hangs_is_reported_and_does_not_come_back(gate: threading.
             gate.wait(10)
         done.append(item)
 
-    worker = NewestWorker(work, "test")
+    worker = Worker(work, "test")
     worker.start(lambda: None)
     worker.offer(0)
     assert begun.wait(5)
