@@ -164,7 +164,7 @@ class FusionConfig:
     error_m: float = option(15.0, "way over which that common error changes", low=0.1, high=1000.0)
     position_floor_m: float = option(0.2, "least standard deviation of an aligned pose", low=0.01, high=10.0)
     heading_floor_deg: float = option(0.4, "the same of its heading", low=0.01, high=10.0)
-    map_error_m: float = option(0.25, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
+    map_error_m: float = option(0.2, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
     map_turn_deg: float = option(0.2, "the same of every heading", low=0.0, high=10.0)
     odometry_error: float = option(0.05, "of odometry, one sigma, share of the way and of the turn", low=1e-4, high=1.0)
     odometry_turn_deg_per_m: float = option(0.3, "what it turns too much or too little a metre", low=0.0, high=45.0)

@@ -10,7 +10,7 @@ from numba import njit
 from scipy import ndimage
 
 from crossloc3d_ros.clouds.filters import check_points
-from crossloc3d_ros.clouds.raster import Raster, fill_holes, surface_raster
+from crossloc3d_ros.clouds.raster import Raster, fill_holes, lowest_raster
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 
@@ -391,7 +391,7 @@ def classify_ground(
     easting, northing, z = np.asarray(points, np.float64)[finite].T
     # A rim of one cell keeps points on the upper edges inside.
     bounds = (easting.min(), northing.min(), easting.max() + cell_m, northing.max() + cell_m)
-    lowest = -surface_raster(np.column_stack([easting, northing, -z]), bounds, cell_m).values.astype(np.float64)
+    lowest = lowest_raster(np.column_stack([easting, northing, z]), bounds, cell_m).values.astype(np.float64)
     lowest[_is_pit(lowest, cell_m)] = np.nan
     holes = np.isnan(lowest)
     surface = _filled(lowest)

@@ -1,4 +1,4 @@
-"""Height rasters of a tile: the terrain, with its holes filled, and the surface."""
+"""Height rasters of a tile: the terrain, with its holes filled, the surface, and the lowest echoes."""
 
 from __future__ import annotations
 
@@ -78,6 +78,12 @@ def surface_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raste
     height, width = _shape(bounds, cell_m)
     values = _highest(np.ascontiguousarray(points, np.float64), bounds[0], bounds[3], cell_m, height, width)
     return Raster(values, bounds[0], bounds[3], cell_m)
+
+
+def lowest_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raster:
+    """Return the lowest of each cell's points (N, 3) in `bounds`, NaN where there is none."""
+    upside_down = surface_raster(np.column_stack([points[:, :2], -points[:, 2]]), bounds, cell_m)
+    return Raster(-upside_down.values, upside_down.west_m, upside_down.north_m, cell_m)
 
 
 def fill_holes(values: Float32Array) -> Float32Array:

@@ -49,6 +49,7 @@ _CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
 _FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
 COARSE_HEADINGS = 48
 _APART_M = 8.0
+_MORE_EVERYWHERE = 4  # so many times the poses that are looked at more closely around candidates
 _PLACE_M = 35.0  # so far from the centre of its submap a pose still is of its place
 _UNSEEN = 0.2  # likelihood ratio of a place that is not among the candidates
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
@@ -146,7 +147,7 @@ class Alignment:
         self._fine = fine_evidence(evidence)
         self._some = self._fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
         self._nearer, self._is_climbed = _no_peaks(), np.empty(0, np.bool_)
-        self._looks = 0
+        self._most_climbed = 0
         self._found, self._followed = _no_climbed(), _no_climbed()
 
     def look_around(self) -> None:
@@ -155,12 +156,14 @@ class Alignment:
             return
         self._aligner.prepare(self._candidates.grid)
         coarse = self._likelihood.levels[0]
-        self._look(around(self._likelihood, coarse, self._places, self._config.radius_m), self._config.peaks)
+        runs = around(self._likelihood, coarse, self._places, self._config.radius_m)
+        self._look(runs, self._config.peaks, self._config.poses)
 
     def look_everywhere(self) -> None:
         """Seek poses on the whole map."""
         self._likelihood.prepare()
-        self._look(inside(self._likelihood, self._likelihood.levels[0]), 2 * self._config.peaks)
+        runs = inside(self._likelihood, self._likelihood.levels[0])
+        self._look(runs, _MORE_EVERYWHERE * self._config.peaks, 2 * self._config.poses)
 
     def follow(self, hypotheses: Hypotheses) -> None:
         """Seek one pose for each hypothesis; those off the map as NaN are left to the climb."""
@@ -195,8 +198,8 @@ class Alignment:
             log_prior=self._aligner.log_prior,
         )
 
-    def _look(self, runs: Int64Array, most: int) -> None:
-        """Seek poses in the runs of coarse cells, and climb from the best of all looks that were not climbed from."""
+    def _look(self, runs: Int64Array, most: int, best: int) -> None:
+        """Seek `most` poses in the runs of coarse cells, and climb from the `best` that were not climbed from."""
         coarse, middle = self._likelihood.levels
         laid = self._evidence.coarser(coarse.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
         seeds = search_cells(laid, coarse, runs, COARSE_HEADINGS, most, _APART_M, self._threads)
@@ -206,9 +209,9 @@ class Alignment:
         nearer = local_search(finer, middle, seeds.poses, 4.0, math.radians(7.5), 2, self._threads)
         self._nearer = Peaks(*map(np.concatenate, zip(vars(self._nearer).values(), vars(nearer).values(), strict=True)))
         self._is_climbed = np.append(self._is_climbed, np.zeros(len(nearer.scores), np.bool_))
-        self._looks += 1
-        best = merge(self._nearer, 4.0, _SAME_RAD)[: self._looks * self._config.poses]
-        fresh = best[~self._is_climbed[best]]
+        self._most_climbed += best
+        merged = merge(self._nearer, 4.0, _SAME_RAD)[: self._most_climbed]
+        fresh = merged[~self._is_climbed[merged]]
         self._is_climbed[fresh] = True
         self._found = self._found.join(self._climbed(self._nearer.poses[fresh], None))
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from crossloc3d_ros.clouds.raster import Bounds
+from crossloc3d_ros.clouds.raster import Bounds, Raster
 from crossloc3d_ros.localization.evidence import CELL_M, CHANNELS, LAYERS, REACH_M
 from crossloc3d_ros.localization.observation_model import MARGIN_CELLS, UNKNOWN, ObservationModel, surface_classes
 from crossloc3d_ros.places.store import AerialMap
@@ -89,35 +89,40 @@ class MapLikelihood:
     def _fill(self, row: int, column: int) -> None:
         """Fill one tile of all levels; the coarse ones look a cell beyond it."""
         reach = MARGIN_CELLS + int(LEVELS_M[0])
-        terrain, surface = self._heights(row - reach, column - reach, _TILE_M + 2 * reach)
-        classes = surface_classes(terrain, surface)
+        terrain, surface, lowest = self._heights(row - reach, column - reach, _TILE_M + 2 * reach)
+        classes = surface_classes(terrain, surface, lowest)
         inner = slice(reach, reach + _TILE_M)
         self._terrain[row : row + _TILE_M, column : column + _TILE_M] = terrain[inner, inner]
         self.classes[row : row + _TILE_M, column : column + _TILE_M] = classes[inner, inner]
         wide = classes[reach : reach + _TILE_M + int(LEVELS_M[0]), reach : reach + _TILE_M + int(LEVELS_M[0])]
         for level in self.levels:
             cell, tile = int(level.cell_m), _TILE_M // int(level.cell_m)
-            ratios = coarse_ratios(self.model.log_ratios, wide, cell)[:, :tile, :tile]
+            ratios = coarse_ratios(self.model.search_ratios, wide, cell)[:, :tile, :tile]
             r, c = row // cell, column // cell
             level.ratios[:, r : r + tile, c : c + tile] = ratios
 
-    def _heights(self, row: int, column: int, cells: int) -> tuple[Float32Array, Float32Array]:
-        """Return terrain and surface (cells, cells), row 0 in the south, NaN off the map."""
+    def _heights(self, row: int, column: int, cells: int) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Return terrain, surface and lowest echoes (cells, cells), row 0 in the south, NaN off the map."""
         west, south = self.west_m + column * CELL_M, self.south_m + row * CELL_M
         bounds = (west, south, west + cells * CELL_M, south + cells * CELL_M)
         low_e, low_n, high_e, high_n = self.aerial_map.bounds
         if bounds[0] >= high_e or bounds[2] <= low_e or bounds[1] >= high_n or bounds[3] <= low_n:
             nothing = np.full((cells, cells), np.nan, np.float32)
-            return nothing, nothing
+            return nothing, nothing, nothing
         inside = (max(bounds[0], low_e), max(bounds[1], low_n), min(bounds[2], high_e), min(bounds[3], high_n))
-        terrain, surface = self.aerial_map.terrain(inside), self.aerial_map.surface(inside)
         middles = (np.arange(cells) + 0.5) * CELL_M
-        # Of a finer raster the highest cell counts, as it would in one of 1 m.
-        parts = max(math.ceil(CELL_M / surface.cell_m - 1e-6), 1)
-        finer = (np.arange(parts * cells) + 0.5) * (CELL_M / parts)
-        heights = surface.nearest(*np.meshgrid(west + finer, south + finer)).reshape(cells, parts, cells, parts)
-        highest: Float32Array = np.fmax.reduce(np.fmax.reduce(heights, axis=3), axis=1)
-        return terrain.sample(*np.meshgrid(west + middles, south + middles)), highest
+        terrain = self.aerial_map.terrain(inside).sample(*np.meshgrid(west + middles, south + middles))
+        surface, lowest = self.aerial_map.surface(inside), self.aerial_map.lowest(inside)
+        return terrain, _extreme(surface, np.fmax, west, south, cells), _extreme(lowest, np.fmin, west, south, cells)
+
+
+def _extreme(raster: Raster, chosen: np.ufunc, west: float, south: float, cells: int) -> Float32Array:
+    """Return (cells, cells) of a raster, row 0 in the south; of finer cells the extreme one, as one of 1 m would."""
+    parts = max(math.ceil(CELL_M / raster.cell_m - 1e-6), 1)
+    finer = (np.arange(parts * cells) + 0.5) * (CELL_M / parts)
+    heights = raster.nearest(*np.meshgrid(west + finer, south + finer)).reshape(cells, parts, cells, parts)
+    extreme: Float32Array = chosen.reduce(chosen.reduce(heights, axis=3), axis=1)
+    return extreme
 
 
 def coarse_ratios(log_ratios: Float32Array, classes: Int32Array, cell: int) -> Int16Array:

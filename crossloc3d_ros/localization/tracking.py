@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +45,8 @@ _LEAST_LOG_WEIGHT = math.log(1e-9)  # lighter hypotheses are dropped
 _LEAST_LOG_NONE = -1e4  # the belief in none falls no lower: what is carried away comes back by itself
 _LARGEST_STD_M = 150.0  # wider ones tell nothing
 _ANY_HEADING = math.pi**2 / 3.0  # variance of a heading of which nothing is known
+_TRAIL = 12  # fixes whose way is compared with that of the odometry
+_TRAIL_M = 2.0  # by how much more than a third they may differ
 _STALE_SHARE = 0.97  # what a further scan of a spot that finds no pose leaves of the hope to find one there
 
 
@@ -139,6 +143,8 @@ class Tracker:
         self._carried = 0.0  # belief that the robot was carried away since the last update
         self._was_localized = False
         self._unknown_reason = ""
+        self._told_m = 0.0  # way that the odometry has told
+        self._trail: deque[tuple[float, Float64Array]] = deque(maxlen=_TRAIL)  # the same at the last fixes, and where
         self._skipped = ""
         self._priors: list[PosePrior] = []
         self._compass: PosePrior | None = None
@@ -223,11 +229,14 @@ class Tracker:
         carried = -math.expm1(-config.carried_per_s * elapsed_s)
         if motion.is_known:
             self._mixture = _moved(self._mixture, motion, config)
+            way_m = float(np.hypot(*motion.delta[:2]))
+            self._told_m += way_m
             if self._moved_m is not None:
-                self._moved_m += float(np.hypot(*motion.delta[:2]))
+                self._moved_m += way_m
         else:
             self._mixture = _spread(self._mixture, elapsed_s, config)
             self._moved_m = None
+            self._trail.clear()
             self._unknown_reason = motion.reason
             carried = 1.0 - (1.0 - carried) * math.exp(-elapsed_s / config.forget_s)
             wide = self._mixture.covariance[:, [0, 1], [0, 1]].max(axis=1, initial=0.0) > _LARGEST_STD_M**2
@@ -436,8 +445,9 @@ class Tracker:
         belief = float(weights[near].sum())
         if is_fix:
             self._was_localized, self._unknown_reason = True, ""
+            self._trail.append((self._told_m, grid[:2]))
             state, reason = TrackState.LOCALIZED, f"one place is believed {_percent(probability)}"
-            reason += _odometry_fault(mixture, leader, config)
+            reason += _odometry_fault(mixture, leader, self._trail, config)
         else:
             if none < 0.5:
                 state = TrackState.AMBIGUOUS
@@ -445,7 +455,7 @@ class Tracker:
                 state = TrackState.LOST if self._was_localized else TrackState.SEARCHING
             reason = self._why_not(mixture, weights, near, probability, belief, none, enough, float(followed))
             if none < 0.5:
-                reason += _odometry_fault(mixture, leader, config)
+                reason += _odometry_fault(mixture, leader, self._trail, config)
             if self._unknown_reason:
                 reason += f", since the motion was unknown: {self._unknown_reason}"
         return Belief(state, reason, probability, grid, heading, covariance, self._hypotheses(), is_fix)
@@ -739,7 +749,9 @@ def _estimate(
     return grid, float(_wrap(pose[2])), covariance, near
 
 
-def _odometry_fault(mixture: _Mixture, leader: int, config: FusionConfig) -> str:
+def _odometry_fault(
+    mixture: _Mixture, leader: int, trail: Sequence[tuple[float, Float64Array]], config: FusionConfig
+) -> str:
     """Say what is wrong with the odometry, as a clause that follows a sentence; empty where nothing is."""
     scale, turn_deg = float(mixture.mean[leader, 6]), math.degrees(mixture.mean[leader, 7])
     if abs(scale) > 3.0 * config.odometry_error:
@@ -747,6 +759,10 @@ def _odometry_fault(mixture: _Mixture, leader: int, config: FusionConfig) -> str
         return f"; the odometry's ways are {abs(scale) / (1.0 + scale):.0%} too {kind}"
     if abs(turn_deg) > 3.0 * config.odometry_turn_deg_per_m:
         return f"; the odometry turns {-turn_deg:+.1f} degrees a metre that the robot does not"
+    if len(trail) == _TRAIL:
+        moved_m, told_m = float(np.hypot(*(trail[-1][1] - trail[0][1]))), trail[-1][0] - trail[0][0]
+        if moved_m > told_m * 4.0 / 3.0 + _TRAIL_M:
+            return f"; odometry and map disagree: of the last {moved_m:.1f} m the odometry tells {told_m:.1f} m"
     if mixture.misfit[leader] > 2.5:
         return f"; odometry and map disagree {mixture.misfit[leader] ** 0.5:.1f} times as much as they should"
     return ""

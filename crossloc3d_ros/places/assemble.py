@@ -70,6 +70,8 @@ def write_map(
     advance(1)
     write_geotiff(folder / store.SURFACE, bounds, config.cell_m, crs, rasters.surface, "surface height")
     advance(1)
+    write_geotiff(folder / store.LOWEST, bounds, config.cell_m, crs, rasters.lowest, "lowest echo")
+    advance(1)
     methods = {source.ground for source in sources}
     manifest = Manifest(
         crs=crs,
@@ -124,6 +126,9 @@ class _TileRasters:
 
     def surface(self, bounds: Bounds) -> Float32Array:
         return self._gather(bounds, "surface")
+
+    def lowest(self, bounds: Bounds) -> Float32Array:
+        return self._gather(bounds, "lowest")
 
     def _gather(self, bounds: Bounds, layer: str) -> Float32Array:
         cell_m, tile_m = self._config.cell_m, self._config.tile_m

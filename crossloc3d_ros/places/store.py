@@ -5,6 +5,7 @@ descriptors.faiss  one descriptor a submap
 submaps.npy        one row a submap: easting, northing, ground height, number of points
 terrain.tif        the ground as GeoTIFF, holes filled
 surface.tif        the highest point of each cell as GeoTIFF
+lowest.tif         the lowest point of each cell as GeoTIFF: whether pulses got through to the ground
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from crossloc3d_ros.places.geotiff import read_geotiff
 from crossloc3d_ros.types import Float64Array, Int32Array
 
 FORMAT = "crossloc3d map"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 MANIFEST, DESCRIPTORS, SUBMAPS = "manifest.json", "descriptors.faiss", "submaps.npy"
-TERRAIN, SURFACE = "terrain.tif", "surface.tif"
-DATA_FILES = (DESCRIPTORS, SUBMAPS, TERRAIN, SURFACE)
+TERRAIN, SURFACE, LOWEST = "terrain.tif", "surface.tif", "lowest.tif"
+DATA_FILES = (DESCRIPTORS, SUBMAPS, TERRAIN, SURFACE, LOWEST)
 
 SUBMAP_DTYPE = np.dtype([("easting", "<f8"), ("northing", "<f8"), ("ground_height", "<f8"), ("points", "<i4")])
 
@@ -132,6 +133,7 @@ class AerialMap:
     index: DescriptorMap
     terrain_path: Path = field(default_factory=Path)
     surface_path: Path = field(default_factory=Path)
+    lowest_path: Path = field(default_factory=Path)
 
     @property
     def bounds(self) -> Bounds:
@@ -151,6 +153,10 @@ class AerialMap:
     def surface(self, bounds: Bounds | None = None) -> Raster:
         """Read the surface, or a part of it."""
         return read_geotiff(self.surface_path, bounds)
+
+    def lowest(self, bounds: Bounds | None = None) -> Raster:
+        """Read the lowest echoes, or a part of them."""
+        return read_geotiff(self.lowest_path, bounds)
 
     @classmethod
     def load(cls, path: str | Path, encoder_fingerprint: str | None = None) -> AerialMap:
@@ -175,7 +181,7 @@ class AerialMap:
                 "build it again"
             )
         frame = MapFrame(manifest.crs, np.array(manifest.origin), manifest.geoid_separation_m)
-        return cls(folder, manifest, frame, submaps, index, folder / TERRAIN, folder / SURFACE)
+        return cls(folder, manifest, frame, submaps, index, folder / TERRAIN, folder / SURFACE, folder / LOWEST)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from crossloc3d_ros.clouds.ground import classify_ground
-from crossloc3d_ros.clouds.raster import Bounds, Raster, surface_raster, terrain_raster
+from crossloc3d_ros.clouds.raster import Bounds, Raster, lowest_raster, surface_raster, terrain_raster
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.formats.las import GROUND
@@ -87,6 +87,7 @@ class TileResult:
     terrain: Float32Array
     """(H, W), row 0 in the north, the tile alone."""
     surface: Float32Array
+    lowest: Float32Array
 
 
 def margin_m(half_extent_m: float, cell_m: float) -> float:
@@ -108,6 +109,7 @@ def build_tile(task: TileTask, encoder: DescriptorEncoder, advance: Callable[[in
     ground_at = time.perf_counter()
     terrain = terrain_raster(points, is_ground, outer, config.cell_m)
     surface = surface_raster(points, outer, config.cell_m)
+    lowest = lowest_raster(points, outer, config.cell_m)
     distance_m = distance_to_points(surface)
     heights = points[:, 2] - terrain.sample(points[:, 0], points[:, 1])
     raster_at = time.perf_counter()
@@ -157,6 +159,7 @@ def build_tile(task: TileTask, encoder: DescriptorEncoder, advance: Callable[[in
             descriptors=np.concatenate(descriptors),
             terrain=known[within],
             surface=surface.values[within],
+            lowest=lowest.values[within],
         ),
     )
     return report
@@ -191,6 +194,7 @@ def write_result(path: Path, result: TileResult) -> None:
                 descriptors=result.descriptors,
                 terrain=result.terrain,
                 surface=result.surface,
+                lowest=result.lowest,
             )
         partial.replace(path)
     finally:
@@ -206,6 +210,7 @@ def read_result(path: Path) -> TileResult:
             descriptors=file["descriptors"],
             terrain=file["terrain"],
             surface=file["surface"],
+            lowest=file["lowest"],
         )
 
 

@@ -21,14 +21,16 @@ from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.evaluation.pose_sets import PoseSet
 from crossloc3d_ros.evaluation.raw_scans import RawScan
 from crossloc3d_ros.localization.alignment import Aligner, fine_counts
-from crossloc3d_ros.localization.evidence import CHANNELS, evidence_of
+from crossloc3d_ros.localization.evidence import CHANNELS, Evidence, evidence_of
 from crossloc3d_ros.localization.likelihood import MapLikelihood
-from crossloc3d_ros.localization.observation_model import CLASSES, ObservationModel, fit_log_ratios
+from crossloc3d_ros.localization.observation_model import CLASSES, OPEN_GROUND, ObservationModel, fit_log_ratios
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import AlignedPoses, Float64Array, no_candidates
 
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
 """A pose is right within these."""
+
+_OTHERS = 8  # poses elsewhere that each scan is laid at
 
 Progress = Callable[[str, float, float, str], None]
 
@@ -58,8 +60,8 @@ def fit_alignment(
     if not on_map or len(on_map) == len(pose_set.scans):
         raise TrainingError("an alignment is learned from scans on the map and off it; the set holds one kind only")
     aerial_map = AerialMap.load(pose_set.map_folder)
-    ratios, expected = fit_log_ratios(_seen(aerial_map, on_map, report))
-    model = ObservationModel(ratios, expected, expected_share=0.0, temperature=1.0)
+    fitted = fit_log_ratios(*_seen(aerial_map, on_map, report))
+    model = ObservationModel(*fitted, expected_share=0.0, temperature=1.0)
     aligner = Aligner(aerial_map, config or AlignmentConfig(), model)
     answers = []
     for i, scan in enumerate(pose_set.scans):
@@ -102,23 +104,42 @@ def is_right(aligned: AlignedPoses, scan: RawScan) -> np.ndarray:
     return np.asarray((away <= RIGHT_M) & (turned <= RIGHT_RAD))
 
 
-def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> Float64Array:
-    """Count (CHANNELS, CLASSES) on which classes the evidence of scans falls at their true poses."""
-    nothing = ObservationModel(np.zeros((CHANNELS, CLASSES), np.float32), np.zeros(CHANNELS))
+def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> tuple[Float64Array, Float64Array]:
+    """Count (CHANNELS, CLASSES) on which classes the evidence of scans falls at their true poses, and at others."""
+    ratios = np.zeros((CHANNELS, CLASSES), np.float32)
+    nothing = ObservationModel(ratios, ratios, np.zeros(CHANNELS))
     likelihood = MapLikelihood(aerial_map, nothing)
     likelihood.prepare()
-    seen = np.zeros((CHANNELS, CLASSES))
+    rng = np.random.default_rng(0)
+    here, elsewhere = np.zeros((CHANNELS, CLASSES)), np.zeros((CHANNELS, CLASSES))
+    others = _places(likelihood)
     for i, scan in enumerate(scans):
         prepared, T = prepared_of(scan), scan.T_base_lidar
         evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
-        c, s = math.cos(scan.heading_rad), math.sin(scan.heading_rad)
-        turned = evidence.xy_m @ np.array([[c, s], [-s, c]])
-        easting, northing = (scan.T_grid_base[:2, 3] + turned).T
-        rows = np.floor(northing - likelihood.south_m).astype(np.int64)
-        columns = np.floor(easting - likelihood.west_m).astype(np.int64)
-        np.add.at(seen, (evidence.channel, likelihood.classes[rows, columns]), 1.0)
+        true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
+        _lay(evidence, likelihood, true, here)
+        for place in others[rng.integers(0, len(others), _OTHERS)]:
+            _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), elsewhere)
         report("learning", i + 1, len(scans), "scans")
-    return seen
+    return here, elsewhere
+
+
+def _places(likelihood: MapLikelihood) -> Float64Array:
+    """Return the places (n, 2) where a robot could stand: middles of cells of open ground."""
+    rows, columns = np.nonzero(np.isin(likelihood.classes, OPEN_GROUND))
+    west, south, east, north = likelihood.aerial_map.bounds
+    x, y = columns + 0.5, rows + 0.5
+    on_map = (x > west - likelihood.west_m) & (x < east - likelihood.west_m)
+    on_map &= (y > south - likelihood.south_m) & (y < north - likelihood.south_m)
+    return np.column_stack([x, y])[on_map]
+
+
+def _lay(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Array, counts: Float64Array) -> None:
+    """Count (CHANNELS, CLASSES) on which classes the evidence falls at a pose (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = (pose[:2] + evidence.xy_m @ np.array([[c, s], [-s, c]])).T
+    classes = likelihood.classes[np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)]
+    np.add.at(counts, (evidence.channel, classes), 1.0)
 
 
 def _answer(aligner: Aligner, scan: RawScan, on_map: bool) -> Answer | None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossloc3d_ros.clouds.raster import Raster, fill_holes, surface_raster, terrain_raster
+from crossloc3d_ros.clouds.raster import Raster, fill_holes, lowest_raster, surface_raster, terrain_raster
 from crossloc3d_ros.errors import CloudError
 
 WEST, SOUTH = 120_600.0, 485_900.0
@@ -31,11 +31,12 @@ def test_row_zero_is_north_and_cells_start_in_the_west() -> None:
 
 @given(st.integers(0, 2**31), st.sampled_from([0.5, 1.0, 3.0]))
 @settings(max_examples=20, deadline=None)
-def test_cells_hold_the_mean_of_the_ground_and_the_highest_of_all(seed: int, cell: float) -> None:
+def test_cells_hold_the_mean_of_the_ground_and_the_highest_and_the_lowest_of_all(seed: int, cell: float) -> None:
     points = scatter(2000, 30.0, seed)
     mask = points[:, 2] < 1.0
     bounds = (WEST, SOUTH, WEST + 30, SOUTH + 30)
     terrain, surface = terrain_raster(points, mask, bounds, cell), surface_raster(points, bounds, cell)
+    lowest = lowest_raster(points, bounds, cell)
     column = ((points[:, 0] - WEST) // cell).astype(int)
     row = ((SOUTH + 30 - points[:, 1]) // cell).astype(int)
     for i in range(0, terrain.values.shape[0], 3):
@@ -45,8 +46,9 @@ def test_cells_hold_the_mean_of_the_ground_and_the_highest_of_all(seed: int, cel
                 assert terrain.values[i, j] == pytest.approx(points[here & mask, 2].mean(), abs=1e-5)
             if here.any():
                 assert surface.values[i, j] == pytest.approx(points[here, 2].max(), abs=1e-6)
+                assert lowest.values[i, j] == pytest.approx(points[here, 2].min(), abs=1e-6)
             else:
-                assert np.isnan(surface.values[i, j])
+                assert np.isnan(surface.values[i, j]) and np.isnan(lowest.values[i, j])
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))

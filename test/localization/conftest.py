@@ -79,21 +79,30 @@ class BoxTown:
 
     def surface(self, cell_m: float = 1.0) -> Float32Array:
         """Return the highest of 16 points of each cell (H, W), row 0 in the north, metres above the sea."""
+        return self._points(cell_m).max(axis=(1, 3))
+
+    def lowest(self, cell_m: float = 1.0) -> Float32Array:
+        """Return the lowest of them."""
+        return self._points(cell_m).min(axis=(1, 3))
+
+    def _points(self, cell_m: float) -> Float32Array:
         cells, fine = round(SIDE_M / cell_m), (np.arange(4 * round(SIDE_M / cell_m)) + 0.5) * cell_m / 4
         x, y = np.meshgrid(fine, fine[::-1])
-        highest = self.height(x.ravel(), y.ravel()).reshape(cells, 4, cells, 4).max(axis=(1, 3))
-        return (highest + 5.0).astype(np.float32)
+        return (self.height(x.ravel(), y.ravel()) + 5.0).reshape(cells, 4, cells, 4).astype(np.float32)
 
 
 def make_map(
     folder: Path, terrain: Float32Array, surface: Float32Array, west: float = WEST, south: float = SOUTH,
-    cell_m: float = 1.0,
+    cell_m: float = 1.0, lowest: Float32Array | None = None,
 ) -> AerialMap:  # fmt: skip
-    """Write both rasters (H, W), row 0 in the north, as a map without any submap worth the name."""
+    """Write rasters (H, W), row 0 in the north, as a map without any submap worth the name.
+
+    Without `lowest` no pulse gets through what stands above the terrain.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     bounds = (west, south, west + terrain.shape[1] * cell_m, south + terrain.shape[0] * cell_m)
     north = bounds[3]
-    for name, values in (("terrain", terrain), ("surface", surface)):
+    for name, values in (("terrain", terrain), ("surface", surface), ("lowest", surface if lowest is None else lowest)):
 
         def block(part: tuple[float, float, float, float], values: Float32Array = values) -> Float32Array:
             row, column = round((north - part[3]) / cell_m), round((part[0] - west) / cell_m)
@@ -109,7 +118,8 @@ def make_map(
     frame = MapFrame(CRS, np.array(manifest.origin))
     submaps = SubmapTable(np.array([[west, south, 5.0]]), np.ones(1, np.int32))
     index = DescriptorMap(np.zeros((1, 1), np.float32))
-    return AerialMap(folder, manifest, frame, submaps, index, folder / "terrain.tif", folder / "surface.tif")
+    rasters = (folder / f"{name}.tif" for name in ("terrain", "surface", "lowest"))
+    return AerialMap(folder, manifest, frame, submaps, index, *rasters)
 
 
 @pytest.fixture(scope="session")
@@ -128,7 +138,7 @@ def box_town() -> BoxTown:
 def box_map(box_town: BoxTown, tmp_path_factory: pytest.TempPathFactory) -> AerialMap:
     """Map the boxes as a survey would."""
     surface = box_town.surface()
-    return make_map(tmp_path_factory.mktemp("box_town"), np.full_like(surface, 5.0), surface)
+    return make_map(tmp_path_factory.mktemp("box_town"), np.full_like(surface, 5.0), surface, lowest=box_town.lowest())
 
 
 @pytest.fixture(scope="session")

@@ -24,9 +24,9 @@ from crossloc3d_ros.localization.search import inside
 from crossloc3d_ros.places.store import AerialMap
 from crossloc3d_ros.types import Float32Array
 
-_RATIOS = np.random.default_rng(0).uniform(-4, 4, (CHANNELS, CLASSES)).astype(np.float32)
-_RATIOS[:, UNKNOWN] = 0.0
-MODEL = ObservationModel(_RATIOS, np.ones(CHANNELS))
+_RATIOS = np.random.default_rng(0).uniform(-3, 3, (2, CHANNELS, CLASSES)).astype(np.float32)
+_RATIOS[:, :, UNKNOWN] = 0.0
+MODEL = ObservationModel(*_RATIOS, np.ones(CHANNELS))
 Maker = Callable[..., AerialMap]
 
 
@@ -58,8 +58,8 @@ def test_coarse_cells_are_the_likeliest_and_the_mean_of_their_fine_ones(cell: in
     assert (ratios[:, :2, :3] == 0).all(), "what is not known says nothing"
 
 
-def heights(rows: int, columns: int, seed: int = 0) -> tuple[Float32Array, Float32Array]:
-    """Return a rolling terrain and boxes and bushes on it, with holes in the surface."""
+def heights(rows: int, columns: int, seed: int = 0) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Return a rolling terrain, boxes and bushes on it with holes, and lowest echoes: of some, pulses get through."""
     rng = np.random.default_rng(seed)
     north, east = np.mgrid[0:rows, 0:columns]
     terrain = 5.0 + 3.0 * np.sin(east / 37.0) + 2.0 * np.cos(north / 23.0)
@@ -68,13 +68,15 @@ def heights(rows: int, columns: int, seed: int = 0) -> tuple[Float32Array, Float
     above += rng.exponential(1.0, (rows, columns)) * (rng.random((rows, columns)) < 0.1)
     surface = terrain + above
     surface[rng.random((rows, columns)) < 0.03] = np.nan
-    return terrain.astype(np.float32), surface.astype(np.float32)
+    lowest = np.where(rng.random((rows, columns)) < 0.05, np.fmin(surface, terrain), surface)
+    return terrain.astype(np.float32), surface.astype(np.float32), lowest.astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def wide_map(map_of: Maker, tmp_path_factory: pytest.TempPathFactory) -> AerialMap:
     """Map 700 x 420 m: several tiles, none of whose borders are the map's."""
-    return map_of(tmp_path_factory.mktemp("wide"), *heights(420, 700))
+    terrain, surface, lowest = heights(420, 700)
+    return map_of(tmp_path_factory.mktemp("wide"), terrain, surface, lowest=lowest)
 
 
 @pytest.fixture(scope="module")
@@ -85,16 +87,16 @@ def whole(wide_map: AerialMap) -> MapLikelihood:
 
 
 def test_tiles_are_seamless(wide_map: AerialMap, whole: MapLikelihood) -> None:
-    terrain, surface = (np.flipud(raster.values) for raster in (wide_map.terrain(), wide_map.surface()))
+    rasters = [np.flipud(raster.values) for raster in (wide_map.terrain(), wide_map.surface(), wide_map.lowest())]
     rows, columns = whole.classes.shape
     south, west = round(wide_map.bounds[1] - whole.south_m), round(wide_map.bounds[0] - whole.west_m)
-    held = [np.full((rows, columns), np.nan, np.float32) for _ in range(2)]
-    for values, into in zip((terrain, surface), held, strict=True):
+    held = [np.full((rows, columns), np.nan, np.float32) for _ in range(3)]
+    for values, into in zip(rasters, held, strict=True):
         into[south : south + 420, west : west + 700] = values
     expected = surface_classes(*held)
     np.testing.assert_array_equal(whole.classes, expected)
     for level in whole.levels:
-        by_hand = coarse_ratios(MODEL.log_ratios, expected, int(level.cell_m))
+        by_hand = coarse_ratios(MODEL.search_ratios, expected, int(level.cell_m))
         # The last row and column of passages have no neighbour to the north and east.
         np.testing.assert_array_equal(level.ratios[:, :-1, :-1], by_hand[:, :-1, :-1])
 
@@ -179,15 +181,15 @@ def test_rasters_of_other_cells_are_compared_in_metres(map_of: Maker, tmp_path: 
     surface = terrain + np.float32(7.0) * on
     likelihood = MapLikelihood(map_of(tmp_path / "map", terrain, surface, west, south, cell_m), MODEL)
     likelihood.prepare()
-    roof = np.argwhere(likelihood.classes == surface_classes(np.zeros((5, 5)), np.full((5, 5), 7.0))[2, 2])
+    roof = np.argwhere(likelihood.classes == surface_classes(np.zeros((9, 9)), *np.full((2, 9, 9), 7.0))[4, 4])
     middle = roof.mean(axis=0) + 0.5 + [likelihood.south_m, likelihood.west_m]
     np.testing.assert_allclose(middle, [south + 26.0, west + 30.0], atol=0.6)
-    # A smooth roof needs roof all around, so that its rim of two cells is missing.
+    # Two cells away from the ground it is a roof of which no pulse got through: its rim of two cells is missing.
     np.testing.assert_allclose(roof.max(axis=0) - roof.min(axis=0) + 1, [16 - 4, 24 - 4], atol=1.01)
 
 
 @pytest.mark.parametrize("parts", [2, 4])
-def test_of_a_finer_raster_the_highest_counts(map_of: Maker, tmp_path: Path, parts: int) -> None:
+def test_of_a_finer_raster_the_highest_and_the_lowest_count(map_of: Maker, tmp_path: Path, parts: int) -> None:
     """A map of finer cells is the same map: nothing is shifted by half a cell, and no thin wall is lost."""
     rng = np.random.default_rng(9)
     size = 80 * parts
@@ -195,11 +197,13 @@ def test_of_a_finer_raster_the_highest_counts(map_of: Maker, tmp_path: Path, par
     fine[rng.random((size, size)) < 0.05] = np.nan
     with np.errstate(invalid="ignore"):
         whole = np.fmax.reduce(np.fmax.reduce(fine.reshape(80, parts, 80, parts), axis=3), axis=1)
+        least = np.fmin.reduce(np.fmin.reduce(fine.reshape(80, parts, 80, parts), axis=3), axis=1)
     classes = []
-    for name, surface in (("fine", fine), ("whole", whole)):
-        surface = surface.astype(np.float32)
+    for name, surface, lowest in (("fine", fine, fine), ("whole", whole, least)):
+        surface, lowest = surface.astype(np.float32), lowest.astype(np.float32)
         cell_m = 80.0 / len(surface)
-        made = map_of(tmp_path / name, np.full_like(surface, 5.0), surface, 628_000.0, 5_803_000.0, cell_m)
+        corner = (628_000.0, 5_803_000.0)
+        made = map_of(tmp_path / name, np.full_like(surface, 5.0), surface, *corner, cell_m, lowest)
         likelihood = MapLikelihood(made, MODEL)
         likelihood.prepare()
         classes.append(likelihood.classes)
@@ -207,7 +211,7 @@ def test_of_a_finer_raster_the_highest_counts(map_of: Maker, tmp_path: Path, par
 
 
 def test_maps_that_lack_half_are_known_in_the_other(map_of: Maker, tmp_path: Path) -> None:
-    terrain, surface = heights(100, 220)
+    terrain, surface, _ = heights(100, 220)
     full = MapLikelihood(map_of(tmp_path / "full", terrain, surface), MODEL)
     for name, values in (("terrain", terrain), ("surface", surface)):
         values = values.copy()
@@ -231,7 +235,7 @@ def test_a_town_of_boxes_is_open_on_its_streets(box_map: AerialMap, box_town: An
     x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(3, 277), np.arange(3, 277)))
     classes = likelihood.classes[112 + 3 : 112 + 277, 112 + 3 : 112 + 277].ravel()
     high = box_town.height(x, y) > 2.5
-    low_return = shipped.log_ratios[1, classes]
+    low_return = shipped.search_ratios[1, classes]
     assert low_return[high].mean() > 0.5
     assert low_return[~high].mean() < -1.0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +29,8 @@ from crossloc3d_ros.types import Float32Array
 STEPS = len(HEIGHTS_M) + 1
 
 
-def heights(seed: int, holes: float = 0.1, size: int = 24) -> tuple[Float32Array, Float32Array]:
-    """Return a terrain and a surface with roofs and crowns, and holes in both."""
+def heights(seed: int, holes: float = 0.1, size: int = 24) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Return a terrain, a surface with roofs and crowns, with holes in both, and lowest echoes."""
     rng = np.random.default_rng(seed)
     terrain = rng.normal(3.0, 0.1, (size, size))
     above = np.kron(rng.choice([0.0, 0.8, 4.0, 7.0, 13.0], (size // 4, size // 4)), np.ones((4, 4)))
@@ -37,7 +38,8 @@ def heights(seed: int, holes: float = 0.1, size: int = 24) -> tuple[Float32Array
     surface = terrain + above
     surface[rng.random((size, size)) < holes] = np.nan
     terrain[rng.random((size, size)) < holes / 4] = np.nan
-    return terrain.astype(np.float32), surface.astype(np.float32)
+    lowest = np.where(rng.random((size, size)) < 0.05, np.fmin(terrain, surface), surface)
+    return terrain.astype(np.float32), surface.astype(np.float32), lowest.astype(np.float32)
 
 
 def in_a_hole(known: npt.NDArray[np.bool_], i: int, j: int) -> bool:
@@ -58,37 +60,31 @@ def gaps_filled(above: Float32Array) -> Float32Array:
     return filled
 
 
-def class_by_hand(above: Float32Array, was_known: npt.NDArray[np.bool_], i: int, j: int) -> int:
-    """Return the class of one cell from its neighbours, edges mirrored as SciPy does."""
-    rows, columns = above.shape
-
-    def at(r: int, c: int) -> float:
-        r, c = (-r - 1 if r < 0 else 2 * rows - 1 - r if r >= rows else r), c
-        c = -c - 1 if c < 0 else 2 * columns - 1 - c if c >= columns else c
-        return float(above[r, c])
-
-    def held(r: int, c: int) -> float:
-        return at(r, c) if math.isfinite(at(r, c)) else 0.0
-
+def class_by_hand(
+    above: Float32Array, was_known: npt.NDArray[np.bool_], reached: npt.NDArray[np.bool_], i: int, j: int
+) -> int:
+    """Return the class of one cell from its neighbours."""
     if not math.isfinite(above[i, j]):
         return HOLE if in_a_hole(was_known, i, j) else UNKNOWN
-    around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)]
-    known = [at(*cell) for cell in around if math.isfinite(at(*cell))]
-    bend = 0.0
-    for r, c in around:
-        r, c = min(max(r, -r - 1), 2 * rows - 1 - r), min(max(c, -c - 1), 2 * columns - 1 - c)
-        bend += abs(held(r - 1, c) + held(r + 1, c) + held(r, c - 1) + held(r, c + 1) - 4.0 * held(r, c)) / 9.0
-    here, low, high = (sum(v >= step for step in HEIGHTS_M) for v in (at(i, j), min(known), max(known)))
-    return int(((here * STEPS + low) * STEPS + high) * 2 + (bend > 2.0))
+
+    def around(values: npt.NDArray[Any], reach: int) -> npt.NDArray[Any]:
+        return values[max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1]
+
+    beside = around(above, 1)
+    here, low, high = (
+        sum(v >= step for step in HEIGHTS_M) for v in (above[i, j], np.nanmin(beside), np.nanmax(beside))
+    )
+    openness = next((reach for reach in range(3) if around(reached, reach).any()), 3)
+    return int(((here * STEPS + low) * STEPS + high) * 4 + openness)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
-    terrain, surface = heights(seed)
-    classes = surface_classes(terrain, surface)
+    terrain, surface, lowest = heights(seed)
+    classes = surface_classes(terrain, surface, lowest)
     above = surface - terrain
-    filled, known = gaps_filled(above), np.isfinite(above)
-    expected = [[class_by_hand(filled, known, i, j) for j in range(24)] for i in range(24)]
+    filled, known, reached = gaps_filled(above), np.isfinite(above), lowest - terrain < 1.0
+    expected = [[class_by_hand(filled, known, reached, i, j) for j in range(24)] for i in range(24)]
     np.testing.assert_array_equal(classes, expected)
     assert len(np.unique(classes)) > 50
     assert (classes[np.isnan(filled)] >= HOLE).all()
@@ -96,14 +92,32 @@ def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
     assert 0 <= classes.min() <= classes.max() < CLASSES
 
 
+def test_houses_are_told_from_trees_by_what_gets_through() -> None:
+    terrain = np.full((40, 40), 2.0, np.float32)
+    surface = terrain.copy()
+    surface[10:30, 10:30] = 9.0
+    house = surface_classes(terrain, surface, surface)
+    lowest = surface.copy()
+    lowest[10:30:3, 10:30:3] = 2.0
+    tree = surface_classes(terrain, surface, lowest)
+    inside = (slice(13, 27), slice(13, 27))
+    assert (house[inside] % 4 == 3).all() and (tree[inside] % 4 < 2).all()
+    assert (house[11:29, 11] % 4 == 2).all() and (house[10:30, 10] % 4 == 1).all(), "beside the open it is not so sure"
+    np.testing.assert_array_equal(house[:8], tree[:8])
+    shipped = ObservationModel.load().log_ratios
+    looked_through = slice(LAYERS, CHANNELS - 1)  # up to 6 m
+    assert (shipped[looked_through, house[20, 20]] < -1.2).all()
+    assert (shipped[looked_through, tree[20, 20]] > -1.2).all()
+
+
 def test_a_cell_s_class_depends_on_no_more_than_the_margin() -> None:
-    terrain, surface = heights(5, size=200)
-    surface[60:90, 20:190] = np.nan  # a canal
-    surface[120:180, 100:170] = np.nan  # more than a hole
-    whole = surface_classes(terrain, surface)
+    rasters = heights(5, size=200)
+    rasters[1][60:90, 20:190] = np.nan  # a canal
+    rasters[1][120:180, 100:170] = np.nan  # more than a hole
+    whole = surface_classes(*rasters)
     for start, stop in ((30, 150), (75, 200)):
         part, inner = slice(start, stop), slice(MARGIN_CELLS, stop - start - MARGIN_CELLS)
-        classes = surface_classes(terrain[part, part], surface[part, part])
+        classes = surface_classes(*(values[part, part] for values in rasters))
         np.testing.assert_array_equal(classes[inner, inner], whole[part, part][inner, inner])
 
 
@@ -111,26 +125,30 @@ def test_a_canal_is_a_hole_and_what_was_not_flown_over_is_none() -> None:
     terrain, surface = (np.full((160, 160), height, np.float32) for height in (3.0, 3.1))
     surface[50:80] = np.nan
     surface[:, 130:] = np.nan
-    classes = surface_classes(terrain, surface)
+    classes = surface_classes(terrain, surface, surface)
     assert (classes[51:79, 30:100] == HOLE).all()
     assert (classes[:, 130:] == UNKNOWN).all()
     wide = surface.copy()
     wide[40:90] = np.nan
-    assert (surface_classes(terrain, wide)[62:68] == UNKNOWN).all(), "50 m without an echo may be anything"
+    assert (surface_classes(terrain, wide, wide)[62:68] == UNKNOWN).all(), "50 m without an echo may be anything"
 
 
 def test_of_a_map_without_terrain_nothing_is_known() -> None:
-    terrain, surface = heights(1)
-    assert (surface_classes(np.full_like(terrain, np.nan), surface) == UNKNOWN).all()
-    assert (surface_classes(terrain, np.full_like(surface, np.nan)) == UNKNOWN).all()
+    terrain, surface, lowest = heights(1)
+    assert (surface_classes(np.full_like(terrain, np.nan), surface, lowest) == UNKNOWN).all()
+    assert (surface_classes(terrain, np.full_like(surface, np.nan), lowest) == UNKNOWN).all()
+
+
+CLOSED = np.append(np.arange(HOLE) % 4 >= 2, np.zeros(CLASSES - HOLE, np.bool_))
 
 
 def test_known_shares_are_recovered() -> None:
     rng = np.random.default_rng(0)
     share = rng.uniform(0.05, 0.6, (LAYERS, CLASSES))
     beams = rng.integers(200_000, 400_000, (LAYERS, CLASSES)).astype(float)
-    seen = np.concatenate([share * beams, (1.0 - share) * beams])
-    ratios, expected = fit_log_ratios(seen)
+    here = np.concatenate([share * beams, (1.0 - share) * beams])
+    elsewhere = here * np.where(CLOSED, rng.uniform(1.0, 9.0, CLASSES), 1.0)
+    full, ratios, expected = fit_log_ratios(here, elsewhere)
     overall = (share * beams).sum(axis=1) / beams.sum(axis=1)
     known = np.arange(CLASSES) != UNKNOWN
     p = np.exp(ratios[:LAYERS]) * overall[:, None]
@@ -138,41 +156,49 @@ def test_known_shares_are_recovered() -> None:
     np.testing.assert_allclose(
         (1.0 - np.exp(ratios[LAYERS:]) * (1.0 - overall[:, None]))[:, known], share[:, known], rtol=0.02
     )
-    assert (ratios[:, UNKNOWN] == 0.0).all()
-    assert (expected > 0).all(), "at the true pose every channel speaks for it"
-    np.testing.assert_allclose(expected, (seen * ratios).sum(axis=1) / seen.sum(axis=1))
+    seen, others = (counts[:LAYERS] + counts[LAYERS:] for counts in (here, elsewhere))
+    rarer = np.log(seen / seen.sum(axis=1, keepdims=True) * others.sum(axis=1, keepdims=True) / others)
+    refuting = np.where(CLOSED & known, np.clip(rarer, -1.0, 0.0), 0.0)
+    assert (rarer[:, CLOSED] < -1.0).any()
+    np.testing.assert_allclose(full, np.clip(ratios + np.tile(refuting, (2, 1)), -3.0, 3.0), atol=0.02)
+    assert (ratios[:, UNKNOWN] == 0.0).all() and (full[:, UNKNOWN] == 0.0).all()
+    np.testing.assert_allclose(expected, (here * full).sum(axis=1) / here.sum(axis=1), rtol=1e-5)
 
 
 def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> None:
-    seen = np.zeros((CHANNELS, CLASSES))
-    seen[:LAYERS, 0], seen[LAYERS:, 0] = 1e6, 1e6
-    seen[0, 1] = 2.0  # two returns of two beams
-    seen[0, 2] = 1e9
-    seen[LAYERS, 3] = 1e9
-    ratios, _ = fit_log_ratios(seen)
+    here = np.zeros((CHANNELS, CLASSES))
+    here[:LAYERS, 0], here[LAYERS:, 0] = 1e6, 1e6
+    here[0, 1] = 2.0  # two returns of two beams
+    here[0, 4] = 1e9
+    here[LAYERS, 5] = 1e9
+    elsewhere = here.copy()
+    elsewhere[0, 6] = 3.0  # inside of something, where elsewhere three beams came
+    full, ratios, _ = fit_log_ratios(here, elsewhere)
     assert 0.0 < ratios[0, 1] < 0.05
-    assert np.abs(ratios).max() <= 4.0
-    np.testing.assert_allclose(ratios[:, 4:], 0.0, atol=1e-6)
+    assert -0.1 < full[0, 6] < 0.0
+    assert max(np.abs(ratios).max(), np.abs(full).max()) <= 3.0
+    np.testing.assert_allclose(ratios[:, 6:], 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("never", ["a return", "a passage", "anything"])
 def test_a_layer_in_which_nothing_happened_says_nothing(never: str) -> None:
-    seen = np.random.default_rng(0).uniform(1, 100, (CHANNELS, CLASSES))
+    here = np.random.default_rng(0).uniform(1, 100, (CHANNELS, CLASSES))
     if never in ("a return", "anything"):
-        seen[LAYERS - 1] = 0.0
+        here[LAYERS - 1] = 0.0
     if never in ("a passage", "anything"):
-        seen[CHANNELS - 1] = 0.0
-    ratios, expected = fit_log_ratios(seen)
-    assert np.isfinite(ratios).all()
+        here[CHANNELS - 1] = 0.0
+    full, ratios, expected = fit_log_ratios(here, here)
+    for values in (full, ratios):
+        assert np.isfinite(values).all()
+        np.testing.assert_allclose(values[[LAYERS - 1, CHANNELS - 1]], 0.0, atol=1e-6)
+        assert np.abs(values[0]).max() > 0.1
     assert np.isfinite(expected).all()
-    np.testing.assert_allclose(ratios[[LAYERS - 1, CHANNELS - 1]], 0.0, atol=1e-6)
-    assert np.abs(ratios[0]).max() > 0.1
 
 
 def model(seed: int = 0) -> ObservationModel:
     rng = np.random.default_rng(seed)
-    ratios = rng.uniform(-3, 3, (CHANNELS, CLASSES)).astype(np.float32)
-    return ObservationModel(ratios, rng.uniform(0, 1, CHANNELS), 0.37, 12.5)
+    ratios = rng.uniform(-3, 3, (2, CHANNELS, CLASSES)).astype(np.float32)
+    return ObservationModel(ratios[0], ratios[1], rng.uniform(0, 1, CHANNELS), 0.37, 12.5)
 
 
 def test_a_model_comes_back_from_its_file_as_it_was(tmp_path: Path) -> None:
@@ -180,6 +206,7 @@ def test_a_model_comes_back_from_its_file_as_it_was(tmp_path: Path) -> None:
     made.save(path)
     read = ObservationModel.load(path)
     np.testing.assert_array_equal(read.log_ratios, made.log_ratios)
+    np.testing.assert_array_equal(read.search_ratios, made.search_ratios)
     np.testing.assert_array_equal(read.expected, made.expected)
     assert (read.expected_share, read.temperature) == (0.37, 12.5)
 
@@ -194,8 +221,8 @@ def test_half_of_the_expected_score_leaves_it_open() -> None:
 
 def test_the_shipped_model_knows_that_walls_return_beams() -> None:
     shipped = ObservationModel.load()
-    street, roof = 0, ((4 * STEPS + 4) * STEPS + 4) * 2  # all below 0.4 m; all between 5 and 10 m
-    edge = ((4 * STEPS + 0) * STEPS + 4) * 2 + 1  # and rough: it falls by more than 5 m
+    street, roof = 0, ((4 * STEPS + 4) * STEPS + 4) * 4 + 3  # all below 0.4 m; all between 5 and 10 m, and closed
+    edge = ((4 * STEPS + 0) * STEPS + 4) * 4 + 1  # beside the ground
     assert np.isfinite(shipped.log_ratios).all()
     assert (shipped.log_ratios[: LAYERS - 1, edge] > 0.5).all()
     assert (shipped.log_ratios[:LAYERS, street] < 0.0).all()
@@ -218,15 +245,21 @@ def test_a_file_that_is_no_model_is_named(tmp_path: Path, damage: str) -> None:
         path.write_bytes(path.read_bytes()[:-1000])
     elif damage == "other shape":
         save_file(
-            {"log_ratios": made.log_ratios[:, :-1].copy(), "expected": made.expected}, path, {"calibration": "{}"}
+            {
+                "log_ratios": made.log_ratios[:, :-1].copy(),
+                "search_ratios": made.search_ratios,
+                "expected": made.expected,
+            },
+            path,
+            {"calibration": "{}"},
         )
     elif damage == "no calibration":
-        save_file({"log_ratios": made.log_ratios, "expected": made.expected}, path)
+        save_file({"log_ratios": made.log_ratios, "search_ratios": made.search_ratios, "expected": made.expected}, path)
     elif damage == "NaN":
         made.log_ratios[2, 5] = np.nan
         made.save(path)
     elif damage == "too steep":
-        made.log_ratios[2, 5] = 50.0
+        made.search_ratios[2, 5] = 50.0
         made.save(path)
     elif damage == "temperature":
         dataclasses.replace(made, temperature=0.0).save(path)

@@ -238,10 +238,10 @@ def test_a_turned_world_gives_the_same_scores(
     likelihood: MapLikelihood, box_map: AerialMap, box_town: Any, map_of: Any, tmp_path: Path, quarter: int
 ) -> None:
     """Cells and blocks that were shifted by half a cell, to whatever side, would score otherwise in a turned world."""
-    terrain, surface = box_map.terrain().values, box_map.surface().values
-    turned = MapLikelihood(
-        map_of(tmp_path, np.rot90(terrain, quarter).copy(), np.rot90(surface, quarter).copy()), likelihood.model
+    terrain, surface, lowest = (
+        np.rot90(raster.values, quarter).copy() for raster in (box_map.terrain(), box_map.surface(), box_map.lowest())
     )
+    turned = MapLikelihood(map_of(tmp_path, terrain, surface, lowest=lowest), likelihood.model)
     turned.prepare()
     rng = np.random.default_rng(8)
     c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter]

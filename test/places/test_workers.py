@@ -34,7 +34,7 @@ def alone(survey_file: Path, weights: Path, tmp_path_factory: pytest.TempPathFac
 
 
 def assert_same_map(ours: Path, theirs: Path) -> None:
-    for name in (store.SUBMAPS, store.TERRAIN, store.SURFACE):
+    for name in (store.SUBMAPS, store.TERRAIN, store.SURFACE, store.LOWEST):
         assert (ours / name).read_bytes() == (theirs / name).read_bytes()
     a, b = AerialMap.load(ours), AerialMap.load(theirs)
     ids = np.arange(len(a.index))

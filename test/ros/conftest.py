@@ -156,7 +156,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     rows = np.array([(*World.grid(place), 1024) for place in range(PLACES)], dtype=store.SUBMAP_DTYPE)
     np.save(map_path / store.SUBMAPS, rows)
     bounds = (ORIGIN[0], ORIGIN[1], ORIGIN[0] + 20, ORIGIN[1] + 20)
-    for name in (store.TERRAIN, store.SURFACE):
+    for name in (store.TERRAIN, store.SURFACE, store.LOWEST):
         write_geotiff(map_path / name, bounds, 1.0, CRS, lambda b: np.zeros((20, 20), np.float32), name)
     manifest = store.Manifest(
         crs=CRS, origin=ORIGIN, bounds=bounds, vertical_reference="ellipsoid", geoid_separation_m=0.0,
