@@ -89,7 +89,8 @@ def test_a_missing_file_is_named(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("version", "advice"), [(2, "update crossloc3d_ros"), (0, "build the map again"), (None, "build")]
+    ("version", "advice"),
+    [(store.FORMAT_VERSION + 1, "update crossloc3d_ros"), (1, "build the map again"), (None, "build")],
 )
 def test_another_format_version_is_refused(folder: Path, version: int | None, advice: str) -> None:
     change_manifest(folder, lambda values: values.update(format_version=version))
