@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +11,13 @@ import numpy as np
 from bench.figure import Figure, median_ms
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
-from crossloc3d_ros.localization.alignment import COARSE_HEADINGS, COARSE_PASSAGES, COARSE_RETURNS, Aligner
+from crossloc3d_ros.localization.alignment import (
+    COARSE_HEADINGS,
+    COARSE_PASSAGES,
+    COARSE_RETURNS,
+    PEAKS_EVERYWHERE,
+    Aligner,
+)
 from crossloc3d_ros.localization.evidence import Evidence, evidence_of
 from crossloc3d_ros.localization.search import search_cells
 from crossloc3d_ros.places.store import AerialMap
@@ -50,7 +55,7 @@ def bench_alignment(aerial_map: AerialMap, scans: list[PreparedScan], runs: int)
         aligner.align(scans[next(turn) % len(scans)], (0.0, 0.0), no_candidates(), everywhere=True)
 
     for count, target in ((25, "150, goal 60"), (100, "")):
-        name = f"alignment: {count} candidates, one thread"
+        name = f"alignment: {count} candidates, {aligner.threads} threads"
         figures.append(Figure(name, median_ms(of(count), runs), "ms", target, note="places drawn by lot"))
     figures.append(Figure("alignment: one hypothesis", median_ms(followed, runs), "ms"))
     figures.append(Figure("alignment: the whole map", median_ms(everywhere, max(runs // 4, 3)), "ms"))
@@ -60,7 +65,8 @@ def bench_alignment(aerial_map: AerialMap, scans: list[PreparedScan], runs: int)
 
 def _large(aligner: Aligner, evidence: Evidence) -> Figure:
     """Time the search of every pose on coarse cells, and scale it to a larger map: it grows with the area."""
-    level, threads = aligner.likelihood.levels[0], min(os.cpu_count() or 1, 4)
+    level, threads = aligner.likelihood.levels[0], aligner.threads
+    most = PEAKS_EVERYWHERE * aligner.config.peaks
     laid = evidence.coarser(level.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
     margin = int(120.0 / level.cell_m)
     rows, columns = level.ratios.shape[1:]
@@ -69,7 +75,7 @@ def _large(aligner: Aligner, evidence: Evidence) -> Figure:
     times = []
     for _ in range(4):
         began = time.perf_counter()
-        search_cells(laid, level, runs, COARSE_HEADINGS, 128, 8.0, threads)
+        search_cells(laid, level, runs, COARSE_HEADINGS, most, 8.0, threads)
         times.append(time.perf_counter() - began)
     area = runs[:, 2].sum() * level.cell_m**2 / 1e6
     seconds = float(np.median(times[1:])) * LARGE_KM2 / area

@@ -6,6 +6,7 @@ A field carries its one default, and in its metadata the sentence that describes
 from __future__ import annotations
 
 import dataclasses
+import os
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -15,6 +16,14 @@ from typing import Any, Literal, TypeVar
 from crossloc3d_ros.errors import ConfigError
 
 T = TypeVar("T")
+
+_MOST_THREADS = 4  # more gain nothing for a single scan
+
+
+def usable_threads() -> int:
+    """Return how many threads work on one scan by default: as many as this process may use cores, at most four."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, _MOST_THREADS)
 
 
 def option(default: T, text: str, *, low: float | None = None, high: float | None = None) -> T:
@@ -127,14 +136,21 @@ class AlignmentConfig:
     )
     exhaustive_km2: float = option(6.0, "largest map that auto searches as a whole", low=0.0, high=1e6)
     exhaustive_every_s: float = option(3.0, "the whole map is searched no more often", low=0.0, high=1e6)
-    convincing: float = option(0.9, "auto does not where a pose at a candidate is believed so", low=0.0, high=1.0)
+    convincing: float = option(
+        0.9, "auto does not where a pose is believed so, at a candidate or followed", low=0.0, high=1.0
+    )
     search_every_s: float = option(0.25, "the candidates no more often while not localized", low=0.0, high=1e6)
     look_every_s: float = option(1.0, "and no more often while localized", low=0.0, high=1e6)
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
     follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
-    peaks: int = option(64, "poses around the candidates that are looked at more closely", low=1, high=1000)
-    poses: int = option(16, "of these, how many in the finest cells", low=1, high=1000)
+    peaks: int = option(
+        64,
+        "poses around the candidates that are looked at more closely; on the whole map four times as many",
+        low=1,
+        high=1000,
+    )
+    poses: int = option(16, "of these, how many in the finest cells; on the whole map twice", low=1, high=1000)
     descriptor_weight: float = option(0.5, "of the candidates' belief beside the alignment's", low=0.0, high=10.0)
     min_cells: int = option(100, "a scan that saw fewer cells says nothing", low=1, high=100_000)
     place_m2: float = option(100.0, "area of the map that counts as one place before a scan", low=0.01, high=1e6)
@@ -226,7 +242,7 @@ class BuildConfig:
     """From an aerial survey to a map."""
 
     spacing_m: float = option(19.0, "distance between the centres of neighbouring submaps", low=1.0, high=1000.0)
-    cell_m: float = option(1.0, "cell of terrain and surface rasters", low=0.1, high=10.0)
+    cell_m: float = option(1.0, "cell of the height rasters", low=0.1, high=10.0)
     tile_m: float = option(380.0, "side of the tiles in which the area is worked through", low=50.0, high=5000.0)
     min_coverage: float = option(0.75, "share of a submap that must have been flown over", low=0.0, high=1.0)
     chunk_points: int = option(1_000_000, "points read from a file at once", low=1000, high=100_000_000)

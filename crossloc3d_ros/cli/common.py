@@ -44,11 +44,8 @@ def run(action: Callable[[], int | None]) -> int:
         except CrossLocError as error:
             print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
             return EXIT_ERROR
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            return EXIT_INTERRUPTED
-        except SystemError as error:
-            # Compiled code that was being loaded when the interrupt came wraps it into this.
+        except (KeyboardInterrupt, SystemError) as error:
+            # Compiled code that was being loaded when the interrupt came wraps it into a SystemError.
             if not _is_interrupt(error):
                 raise
             print("interrupted", file=sys.stderr)

@@ -156,9 +156,9 @@ def _replay(arguments: argparse.Namespace) -> int:
                 display("localize", done, total, "scans")
                 let_through()
 
+            localizer.warm_up()
+            let_through()
             try:
-                localizer.warm_up()
-                let_through()
                 localize_bag(
                     bag,
                     topic,
@@ -170,6 +170,7 @@ def _replay(arguments: argparse.Namespace) -> int:
                     odometry=odometry,
                     progress=show,
                 )
+                let_through()
             except BagError as error:
                 broken = error  # what was read before the damage is worth its figures
             except KeyboardInterrupt:

@@ -82,6 +82,7 @@ def surface_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raste
 
 def lowest_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raster:
     """Return the lowest of each cell's points (N, 3) in `bounds`, NaN where there is none."""
+    check_points(points)
     upside_down = surface_raster(np.column_stack([points[:, :2], -points[:, 2]]), bounds, cell_m)
     return Raster(-upside_down.values, upside_down.west_m, upside_down.north_m, cell_m)
 

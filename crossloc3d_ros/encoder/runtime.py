@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
-from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PreprocessingConfig, from_dict
+from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PreprocessingConfig, from_dict, usable_threads
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import CheckpointError, CloudError, ConfigError
 from crossloc3d_ros.types import Float32Array
 
-MAX_THREADS = 4
-"""More threads than this gain nothing for a single cloud."""
 MAX_HEADINGS = 64
 
 
@@ -38,8 +35,7 @@ class Encoder:
         self._device = device
         self._compiled = None
         if device == "cpu" and isinstance(model, CrossLoc3D) and CompiledModel.can_compile(model):
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            self._compiled = CompiledModel(model, min(cores, MAX_THREADS) if threads is None else threads)
+            self._compiled = CompiledModel(model, usable_threads() if threads is None else threads)
         self._preprocessing = preprocessing
         self._fingerprint = fingerprint
         self.metadata = dict(metadata or {})

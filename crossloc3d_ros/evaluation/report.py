@@ -259,8 +259,8 @@ def _steps_table(table: EstimateTable, frame: MapFrame) -> str:
         f"</thead><tbody>{''.join(rows)}</tbody></table></div>"
         '<p class="below">The first two rows look at one scan alone, as if the robot had just been switched on, '
         "believed or not; of aligned poses count those that were found around the candidates or on the whole map, "
-        "which are looked for at every scan only while the place is not known. The last row gives no fix where it is "
-        "not sure.</p>"
+        "which are looked for a few times a second, and less often once the place is known. The last row gives no fix "
+        "where it is not sure.</p>"
     )
 
 

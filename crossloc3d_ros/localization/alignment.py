@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from dataclasses import dataclass
 
 import numpy as np
 
 from crossloc3d_ros.clouds.scan import PreparedScan
-from crossloc3d_ros.config import AlignmentConfig
+from crossloc3d_ros.config import AlignmentConfig, usable_threads
 from crossloc3d_ros.localization.evidence import Evidence, evidence_of
 from crossloc3d_ros.localization.likelihood import MapLikelihood
 from crossloc3d_ros.localization.observation_model import ObservationModel
@@ -49,7 +48,7 @@ _CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
 _FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
 COARSE_HEADINGS = 48
 _APART_M = 8.0
-_MORE_EVERYWHERE = 4  # so many times the poses that are looked at more closely around candidates
+PEAKS_EVERYWHERE, POSES_EVERYWHERE = 4, 2  # so many times as many on the whole map as around candidates
 _PLACE_M = 35.0  # so far from the centre of its submap a pose still is of its place
 _UNSEEN = 0.2  # likelihood ratio of a place that is not among the candidates
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
@@ -67,7 +66,7 @@ class Aligner:
         self.aerial_map, self.config = aerial_map, config
         self.model = model or ObservationModel.load()
         self.likelihood = MapLikelihood(aerial_map, self.model)
-        self.threads = min(os.cpu_count() or 1, 4)
+        self.threads = usable_threads()
         west, south, east, north = aerial_map.bounds
         self.area_m2 = (east - west) * (north - south)
         self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
@@ -163,7 +162,7 @@ class Alignment:
         """Seek poses on the whole map."""
         self._likelihood.prepare()
         runs = inside(self._likelihood, self._likelihood.levels[0])
-        self._look(runs, _MORE_EVERYWHERE * self._config.peaks, 2 * self._config.poses)
+        self._look(runs, PEAKS_EVERYWHERE * self._config.peaks, POSES_EVERYWHERE * self._config.poses)
 
     def follow(self, hypotheses: Hypotheses) -> None:
         """Seek one pose for each hypothesis; those off the map as NaN are left to the climb."""

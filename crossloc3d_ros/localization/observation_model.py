@@ -7,9 +7,9 @@ but in no house. For each class and each layer of height, places of known pose t
 was returned. With p that share and q the share over all cells, a return speaks for a place by log(p / q), a passage by
 log((1 - p) / (1 - q)): the log likelihood ratio between "the scan was taken here" and "somewhere".
 
-Inside of a house both are as rare, since the beams that would come there end at its walls. So cells where no pulse got
-through count by how often beams come there at all, at true poses and at others: log(v / w), with v and w the shares of
-the class among all cells seen. This is what refutes a pose from which the robot would look through houses.
+Inside of a house both are as rare, since the beams that would come there end at its walls. So cells beside which no
+pulse got through count by how often beams come there at all, at true poses and at others: log(v / w), with v and w the
+shares of the class among all cells seen. This is what refutes a pose from which the robot would look through houses.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "alignment.safete
 HEIGHTS_M = np.array([0.4, 1.2, 2.5, 5.0, 10.0])
 """Heights above the terrain between which the classes change."""
 _STEPS = len(HEIGHTS_M) + 1
-_OPENNESS = 4  # of a cell: pulses reach the ground in it, beside it, one cell farther, or nowhere near
+_CLOSEDNESS = 4  # steps: pulses reach the ground in the cell, beside it, one cell farther, or nowhere near
 _GROUND_M = 1.0  # an echo so low above the terrain came from the ground
 _HOLE_M = 20  # half the width of the widest hole in a survey that is taken for water
-HOLE = _OPENNESS * _STEPS**3
+HOLE = _CLOSEDNESS * _STEPS**3
 """Class of a cell without an echo in the midst of those that have one: mostly water, which mirrors pulses away."""
 UNKNOWN = HOLE + 1
 """Class of a cell of which the survey says nothing."""
@@ -48,7 +48,7 @@ MARGIN_CELLS = 2 * _HOLE_M + 4
 _PRIOR = 50.0  # observations that a class starts with
 _STEEPEST = 3.0  # no single cell says more; the search's 16 bit numbers rest on it
 _REFUTES = 1.0  # nor does it refute more: a house may have gone since the survey, and hundreds of its cells with it
-_CLOSED = 2  # from this openness on a cell is inside of something
+_CLOSED = 2  # from this step on a cell is inside of something
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
     near, around = ndimage.maximum_filter(reached, 3), ndimage.maximum_filter(reached, 5)
     closed = 3 - reached.astype(np.int64) - near - around
     steps = [np.digitize(values, HEIGHTS_M) for values in (held, least, most)]
-    classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * _OPENNESS + closed
+    classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * _CLOSEDNESS + closed
     return (classes if known.all() else np.where(known, classes, unseen)).astype(np.int32)
 
 
@@ -148,8 +148,8 @@ def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32
     """Return log ratios and search ratios (CHANNELS, CLASSES), and what to expect at true poses (CHANNELS,).
 
     `here` and `elsewhere` (CHANNELS, CLASSES) count the cells of each channel that fell on each class at true poses,
-    and at others. A layer from which all beams were returned, or none, tells nothing; a class that was hardly met
-    little.
+    and at others. A layer from which all beams were returned, or none, tells nothing but where beams came; a class
+    that was hardly met little.
     """
     returns, passages = here[:LAYERS], here[LAYERS:]
     seen, others = returns + passages, elsewhere[:LAYERS] + elsewhere[LAYERS:]
@@ -161,7 +161,7 @@ def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32
     v, w = (values / np.maximum(values.sum(axis=1, keepdims=True), 1.0) for values in (seen, others))
     prior = _PRIOR / np.maximum(seen.sum(axis=1, keepdims=True), _PRIOR)
     closed = np.zeros(CLASSES, np.bool_)
-    closed[:HOLE] = np.arange(HOLE) % _OPENNESS >= _CLOSED
+    closed[:HOLE] = np.arange(HOLE) % _CLOSEDNESS >= _CLOSED
     refuting = np.where(closed, np.clip(np.log((v + prior) / (w + prior)), -_REFUTES, 0.0), 0.0)
     full = ratios + np.tile(refuting, (2, 1))
     for values in (ratios, full):

@@ -26,7 +26,7 @@ _MOVES = 6  # at most so many moves on each step of the climb
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Poses at which the evidence fits, best first."""
+    """Poses at which the evidence fits."""
 
     poses: Float64Array
     """(p, 3) metres east and north of the likelihood's south-west corner, heading in radians from east."""
@@ -37,11 +37,11 @@ class Peaks:
 def search_cells(
     evidence: Evidence, level: Level, runs: Int64Array, headings: int, most: int, apart_m: float, threads: int = 1
 ) -> Peaks:
-    """Return the best poses with the base in one of the cells of a level that `runs` names, at least `apart_m` apart.
+    """Return the best poses with the base in one of the cells of a level that `runs` names, best first.
 
-    `runs` (R, 3): row, first column and length of stretches of cells, as `around` and `inside` give them; so far from
-    the edge of the level that the evidence stays inside. `evidence` is in cells of the level, its passages in blocks
-    of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
+    They are at least `apart_m` apart. `runs` (R, 3): row, first column and length of stretches of cells, as `around`
+    and `inside` give them; so far from the edge of the level that the evidence stays inside. `evidence` is in cells of
+    the level, its passages in blocks of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
     """
     if not len(runs) or not len(evidence):
         return Peaks(np.empty((0, 3)), np.empty(0))

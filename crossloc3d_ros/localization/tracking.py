@@ -133,6 +133,11 @@ class Tracker:
         """Stamp of the last scan that counted, where the next motion has to begin; None before the first."""
         return self._stamp_ns
 
+    @property
+    def skips(self) -> bool:
+        """Whether the scan that `predict` was told of changes nothing: it is late, or a repeated one."""
+        return bool(self._skipped)
+
     def reset(self) -> None:
         """Forget everything."""
         self._stamp_ns: int | None = None
@@ -414,6 +419,10 @@ class Tracker:
 
     # Judgement
 
+    def _since_m(self) -> float:
+        """Return the way that the odometry has told since the last fix."""
+        return self._told_m - self._trail[-1][0]
+
     def _hypotheses(self) -> Hypotheses:
         mixture = self._mixture
         return Hypotheses(
@@ -445,6 +454,8 @@ class Tracker:
         belief = float(weights[near].sum())
         if is_fix:
             self._was_localized, self._unknown_reason = True, ""
+            if self._trail and np.hypot(*(grid[:2] - self._trail[-1][1])) > RIGHT_WITHIN_M + self._since_m():
+                self._trail.clear()  # another place, to which nobody has driven
             self._trail.append((self._told_m, grid[:2]))
             state, reason = TrackState.LOCALIZED, f"one place is believed {_percent(probability)}"
             reason += _odometry_fault(mixture, leader, self._trail, config)
@@ -455,7 +466,7 @@ class Tracker:
                 state = TrackState.LOST if self._was_localized else TrackState.SEARCHING
             reason = self._why_not(mixture, weights, near, probability, belief, none, enough, float(followed))
             if none < 0.5:
-                reason += _odometry_fault(mixture, leader, self._trail, config)
+                reason += _odometry_fault(mixture, leader, (), config)
             if self._unknown_reason:
                 reason += f", since the motion was unknown: {self._unknown_reason}"
         return Belief(state, reason, probability, grid, heading, covariance, self._hypotheses(), is_fix)

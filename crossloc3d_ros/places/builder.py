@@ -40,7 +40,7 @@ from crossloc3d_ros.types import DescriptorEncoder
 _log = logging.getLogger(__name__)
 _MOST_AREA_A_POINT_M2 = 25.0
 
-_WORK_VERSION = 1
+_WORK_VERSION = 2
 """Raised when the files of the work folder change: an older half-done build is started anew then."""
 
 
@@ -480,7 +480,7 @@ def bytes_needed(headers: Sequence[AerialHeader], config: BuildConfig, descripto
         width, height = _extent_m(header)
         # The box of a header with a stray point, or a broken one, says nothing about the area.
         area_m2 += min(width * height, _MOST_AREA_A_POINT_M2 * header.point_count)
-    rasters = 2 * 4 * area_m2 / config.cell_m**2
+    rasters = 3 * 4 * area_m2 / config.cell_m**2
     submaps = area_m2 / config.spacing_m**2 * (4 * descriptor_size + store.SUBMAP_DTYPE.itemsize)
     return int(points + 2 * (rasters + submaps))
 

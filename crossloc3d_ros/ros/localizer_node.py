@@ -106,20 +106,24 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
 
 
-@dataclass(frozen=True)
+class HeadingSample(NamedTuple):
+    """An IMU's message and how its axes lie on the base."""
+
+    message: Imu
+    R_base_imu: Float64Array
+
+
+@dataclass(frozen=True, eq=False)
 class Arrival:
     """A cloud and when it came in."""
 
     message: PointCloud2
     received_s: float
     """Monotonic clock."""
-
-
-class HeadingSample(NamedTuple):
-    """An IMU's message and how its axes lie on the base."""
-
-    message: Imu
-    R_base_imu: Float64Array
+    up_base: Float64Array | None
+    """(3,) where up was by then; None where no IMU tells it."""
+    heading: HeadingSample | None
+    """What the IMU had said of the heading by then."""
 
 
 class LocalizerNode(LifecycleNode):
@@ -249,6 +253,7 @@ class LocalizerNode(LifecycleNode):
             self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m)
         self._gravity = GravityFilter(config.imu_time_constant_s)
         self._localizer = localizer = self._load(config)
+        self._worker = Worker(self._process, "localize", config.most_waiting)
         self._outputs = {
             "fix": self.create_lifecycle_publisher(NavSatFix, "~/fix", 10),
             "pose": self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),
@@ -367,7 +372,9 @@ class LocalizerNode(LifecycleNode):
 
     def _receive(self, message: PointCloud2) -> None:
         self._statistics.received()
-        self._statistics.dropped(self._worker.offer(Arrival(message, time.monotonic())))
+        up_base = self._gravity.up(stamp_of(message)) if self._config.use_imu else None
+        arrival = Arrival(message, time.monotonic(), up_base, self._heading)
+        self._statistics.dropped(self._worker.offer(arrival))
 
     def _receive_odometry(self, message: Odometry) -> None:
         if self._odometry is None:
@@ -508,7 +515,7 @@ class LocalizerNode(LifecycleNode):
     # One scan, in the worker's thread
 
     def _process(self, arrival: Arrival) -> None:
-        outcome = self._localize(arrival.message)
+        outcome = self._localize(arrival)
         try:
             self._publish(outcome.estimate)
         except Exception:
@@ -517,21 +524,20 @@ class LocalizerNode(LifecycleNode):
         self._statistics.processed(outcome, 1e3 * (time.monotonic() - arrival.received_s))
         self._tell(outcome)
 
-    def _localize(self, message: PointCloud2) -> Outcome:
+    def _localize(self, arrival: Arrival) -> Outcome:
         """Return what comes of a message; every failure becomes an estimate without a fix, with its reason."""
-        localizer = self._localizer
+        localizer, message = self._localizer, arrival.message
         stamp_ns = stamp_of(message)
         try:
             if localizer is None:
                 raise CloudError("the node is being cleaned up")
             scan = scan_from_pointcloud2(message)
             T_base_lidar = None if self._transforms is None else self._transforms.pose_on_base(scan.frame_id)
-            gravity = self._gravity.up(stamp_ns) if self._config.use_imu else None
             while self._orders:
                 self._orders.popleft()(localizer, stamp_ns)
-            self._guess_heading(localizer, stamp_ns)
+            self._guess_heading(localizer, arrival.heading, stamp_ns)
             motion = self._motion(localizer.stamp_ns, scan, T_base_lidar)
-            estimate = localizer.localize(scan, gravity, T_base_lidar, motion)
+            estimate = localizer.localize(scan, arrival.up_base, T_base_lidar, motion)
             if not len(estimate.candidates):  # nothing that could have changed what is known
                 estimate = replace(estimate, state=self._state)
             self._state = estimate.state
@@ -558,9 +564,9 @@ class LocalizerNode(LifecycleNode):
         source = self._odometry or self._scan_odometry
         return None if source is None or from_ns is None else source.motion(from_ns, scan.stamp_ns)
 
-    def _guess_heading(self, localizer: Localizer, stamp_ns: int) -> None:
+    def _guess_heading(self, localizer: Localizer, sample: HeadingSample | None, stamp_ns: int) -> None:
         """Hand on what the IMU says of the heading, as long as nothing better is known."""
-        sample, config = self._heading, self._config
+        config = self._config
         if sample is None or self._state is TrackState.LOCALIZED:
             return
         if abs(stamp_ns - stamp_of(sample.message)) > HEADING_AGE_NS:

@@ -1,8 +1,8 @@
 """Learn what air and ground have in common, and what a score of it means, from simulated towns of known poses.
 
-First the log likelihood ratios: how often a beam was returned from a cell, by what the aerial map shows there. Then the
-calibration: every scan is sought on the whole map, and what its best poses scored, right, wrong or off the map, tells
-which score to believe.
+First the log likelihood ratios: how often a beam was returned from a cell, by what the aerial map shows there, and how
+often beams come inside of what the map shows closed, at true poses and at others. Then the calibration: every scan is
+sought on the whole map, and what its best poses scored, right, wrong or off the map, tells which score to believe.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> 
 
 def _places(likelihood: MapLikelihood) -> Float64Array:
     """Return the places (n, 2) where a robot could stand: middles of cells of open ground."""
-    rows, columns = np.nonzero(np.isin(likelihood.classes, OPEN_GROUND))
+    rows, columns = np.nonzero(likelihood.classes == OPEN_GROUND)
     west, south, east, north = likelihood.aerial_map.bounds
     x, y = columns + 0.5, rows + 0.5
     on_map = (x > west - likelihood.west_m) & (x < east - likelihood.west_m)

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import json
 import logging
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +18,9 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig, from_dict, to_dict
+from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig, from_dict, to_dict, usable_threads
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.encoder.networks import PUBLISHED, make_network
-from crossloc3d_ros.encoder.runtime import MAX_THREADS
 from crossloc3d_ros.errors import ConfigError, CrossLocError, TrainingError
 from crossloc3d_ros.evaluation.encoding import EncodingJob, time_queries
 from crossloc3d_ros.evaluation.predictions import (
@@ -320,7 +318,7 @@ class Comparison:
         plan = Plan(("aerial",), ("random",), (count,), invariant=way == "mean")
         job = EncodingJob(encoder, loader, self.cache, self.workers, self.encoding)
         before = torch.get_num_threads()
-        torch.set_num_threads(_threads())
+        torch.set_num_threads(usable_threads())
         try:
             made = predict_all(self.evaluation_set, job, plan, row.name)
         finally:
@@ -408,8 +406,3 @@ def _ended_budget(folder: Path) -> str | None:
     """Return the budget that the run in a folder has used up; None where it has not ended."""
     path = folder / ENDED
     return path.read_text().strip() if path.exists() else None
-
-
-def _threads() -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MAX_THREADS)
