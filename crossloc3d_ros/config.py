@@ -139,7 +139,7 @@ class AlignmentConfig:
     convincing: float = option(
         0.9, "auto does not where a pose is believed so, at a candidate or followed", low=0.0, high=1.0
     )
-    search_every_s: float = option(0.25, "the candidates no more often while not localized", low=0.0, high=1e6)
+    search_every_s: float = option(0.45, "the candidates no more often while not localized", low=0.0, high=1e6)
     look_every_s: float = option(1.0, "and no more often while localized", low=0.0, high=1e6)
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
     radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)

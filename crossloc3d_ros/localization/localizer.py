@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -54,13 +55,14 @@ class Localizer:
         scan: Scan,
         gravity_base: Float64Array | None = None,
         T_base_lidar: Float64Array | None = None,
-        motion: Motion | None = None,
+        motion: Motion | Callable[[], Motion | None] | None = None,
     ) -> Estimate:
         """Return where `scan` was taken.
 
         `gravity_base` (3,) is the unit vector that points up, measured in the base frame, where an IMU gives one;
         `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it. `motion` leads from the
-        last scan that counted (`stamp_ns` of this object) to this one; None = not known.
+        last scan that counted (`stamp_ns` of this object) to this one; None = not known. A function is asked for it
+        when the descriptor is done: odometry may arrive later than the scan.
         """
         watch = Watch()
         if T_base_lidar is None:
@@ -77,6 +79,7 @@ class Localizer:
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
+        motion = motion() if callable(motion) else motion
         step = self._within_turn(scan.stamp_ns, motion)
         hypotheses = self._tracker.predict(scan.stamp_ns, motion)
         aligned = self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses)

@@ -536,7 +536,12 @@ class LocalizerNode(LifecycleNode):
             while self._orders:
                 self._orders.popleft()(localizer, stamp_ns)
             self._guess_heading(localizer, arrival.heading, stamp_ns)
-            motion = self._motion(localizer.stamp_ns, scan, T_base_lidar)
+            if self._scan_odometry is not None:
+                self._take_scan(scan, T_base_lidar)
+
+            def motion() -> Motion | None:
+                return self._motion(localizer.stamp_ns, scan.stamp_ns)
+
             estimate = localizer.localize(scan, arrival.up_base, T_base_lidar, motion)
             if not len(estimate.candidates):  # nothing that could have changed what is known
                 estimate = replace(estimate, state=self._state)
@@ -552,17 +557,20 @@ class LocalizerNode(LifecycleNode):
         """Return what comes of a message that says nothing: no fix, and no other state than before."""
         return Outcome(replace(no_estimate(stamp_ns, reason), state=self._state), is_fault=True)
 
-    def _motion(self, from_ns: int | None, scan: Scan, T_base_lidar: Float64Array | None) -> Motion | None:
+    def _take_scan(self, scan: Scan, T_base_lidar: Float64Array | None) -> None:
+        """Let the odometry from scan to scan see a scan."""
+        assert self._scan_odometry is not None
+        config = self._config.scan
+        T = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
+        ranges = np.linalg.norm(scan.points, axis=1)
+        used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
+        self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points[used]).astype(np.float64))
+
+    def _motion(self, from_ns: int | None, to_ns: int) -> Motion | None:
         """Return how the robot moved from the scan that the hypotheses stand at; None where there is none, or no
         odometry."""
-        if self._scan_odometry is not None:
-            config = self._config.scan
-            T = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
-            ranges = np.linalg.norm(scan.points, axis=1)
-            used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
-            self._scan_odometry.add(scan.stamp_ns, transform_points(T, scan.points[used]).astype(np.float64))
         source = self._odometry or self._scan_odometry
-        return None if source is None or from_ns is None else source.motion(from_ns, scan.stamp_ns)
+        return None if source is None or from_ns is None else source.motion(from_ns, to_ns)
 
     def _guess_heading(self, localizer: Localizer, sample: HeadingSample | None, stamp_ns: int) -> None:
         """Hand on what the IMU says of the heading, as long as nothing better is known."""

@@ -54,6 +54,7 @@ class StandIn:
         self.prior = prior
 
     def localize(self, scan: Scan, gravity_base: Any = None, T_base_lidar: Any = None, motion: Any = None) -> Estimate:
+        motion = motion() if callable(motion) else motion
         prepared = prepare_scan(scan, self.config.scan, self.encoder.preprocessing, gravity_base, T_base_lidar)
         if prepared.patch is None:
             return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts)
