@@ -148,6 +148,7 @@ class Tracker:
         self._carried = 0.0  # belief that the robot was carried away since the last update
         self._was_localized = False
         self._unknown_reason = ""
+        self._without_fix = 0  # scans since the last fix
         self._told_m = 0.0  # way that the odometry has told
         self._trail: deque[tuple[float, Float64Array]] = deque(maxlen=_TRAIL)  # the same at the last fixes, and where
         self._skipped = ""
@@ -457,6 +458,7 @@ class Tracker:
             if self._trail and np.hypot(*(grid[:2] - self._trail[-1][1])) > RIGHT_WITHIN_M + self._since_m():
                 self._trail.clear()  # another place, to which nobody has driven
             self._trail.append((self._told_m, grid[:2]))
+            self._without_fix = 0
             state, reason = TrackState.LOCALIZED, f"one place is believed {_percent(probability)}"
             reason += _odometry_fault(mixture, leader, self._trail, config)
         else:
@@ -464,9 +466,12 @@ class Tracker:
                 state = TrackState.AMBIGUOUS
             else:
                 state = TrackState.LOST if self._was_localized else TrackState.SEARCHING
+            self._without_fix += 1
+            if self._without_fix > _TRAIL // 2:
+                self._trail.clear()  # it tells of another time
             reason = self._why_not(mixture, weights, near, probability, belief, none, enough, float(followed))
             if none < 0.5:
-                reason += _odometry_fault(mixture, leader, (), config)
+                reason += _odometry_fault(mixture, leader, self._trail, config)
             if self._unknown_reason:
                 reason += f", since the motion was unknown: {self._unknown_reason}"
         return Belief(state, reason, probability, grid, heading, covariance, self._hypotheses(), is_fix)

@@ -44,7 +44,7 @@ TEXTS = TableTexts("Competitors <here>", ("Some places & others.",))
 def one_thread() -> Iterator[None]:
     """Work with one thread: two that wait for each other on a busy machine take minutes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparison, "_threads", lambda: 1)
+        patch.setattr(comparison, "usable_threads", lambda: 1)
         yield
 
 
