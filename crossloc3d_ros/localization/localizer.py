@@ -150,9 +150,10 @@ class Localizer:
         if not self._tracker.skips:
             if looks.around(stamp_ns) and config.search != "exhaustive":
                 alignment.look_around()
-            is_enough = config.search == "auto" and alignment.is_convincing()
-            if aligner.searches_everywhere and not is_enough and looks.everywhere(stamp_ns):
-                alignment.look_everywhere()
+            if aligner.searches_everywhere:
+                is_enough = config.search == "auto" and alignment.is_convincing()
+                if not is_enough and looks.everywhere(stamp_ns):
+                    alignment.look_everywhere()
         return alignment.result()
 
     def _within_turn(self, stamp_ns: int, motion: Motion | None) -> Float64Array:

@@ -420,10 +420,6 @@ class Tracker:
 
     # Judgement
 
-    def _since_m(self) -> float:
-        """Return the way that the odometry has told since the last fix."""
-        return self._told_m - self._trail[-1][0]
-
     def _hypotheses(self) -> Hypotheses:
         mixture = self._mixture
         return Hypotheses(
@@ -455,8 +451,10 @@ class Tracker:
         belief = float(weights[near].sum())
         if is_fix:
             self._was_localized, self._unknown_reason = True, ""
-            if self._trail and np.hypot(*(grid[:2] - self._trail[-1][1])) > RIGHT_WITHIN_M + self._since_m():
-                self._trail.clear()  # another place, to which nobody has driven
+            if self._trail:
+                told_m, place = self._trail[-1]
+                if np.hypot(*(grid[:2] - place)) > RIGHT_WITHIN_M + self._told_m - told_m:
+                    self._trail.clear()  # another place, to which nobody has driven
             self._trail.append((self._told_m, grid[:2]))
             self._without_fix = 0
             state, reason = TrackState.LOCALIZED, f"one place is believed {_percent(probability)}"

@@ -44,51 +44,51 @@ def gate() -> Iterator[threading.Event]:
     event.set()
 
 
+class HeldWork:
+    """Work that does not end before its gate is opened."""
+
+    def __init__(self, gate: threading.Event) -> None:
+        self.gate, self.begun = gate, threading.Event()
+        self.done: list[int] = []
+
+    def __call__(self, item: int) -> None:
+        self.begun.set()
+        self.gate.wait(10)
+        self.done.append(item)
+
+    def finish(self, count: int) -> None:
+        """Open the gate and wait until so many items are done."""
+        self.gate.set()
+        deadline = time.monotonic() + 5
+        while len(self.done) < count and time.monotonic() < deadline:
+            time.sleep(0.005)
+
+
 def test_only_the_newest_of_those_that_wait_is_worked_on(gate: threading.Event) -> None:
-    done: list[int] = []
-    begun = threading.Event()
-
-    def work(item: int) -> None:
-        begun.set()
-        gate.wait(10)
-        done.append(item)
-
+    work = HeldWork(gate)
     worker = Worker(work, "test")
     worker.start(lambda: None)
     assert worker.offer(0) == 0
-    assert begun.wait(5)
+    assert work.begun.wait(5)
     assert [worker.offer(i) for i in range(1, 6)] == [0, 1, 1, 1, 1]
-    gate.set()
-    deadline = time.monotonic() + 5
-    while len(done) < 2 and time.monotonic() < deadline:
-        time.sleep(0.005)
+    work.finish(2)
     assert worker.stop()
-    assert done == [0, 5]
+    assert work.done == [0, 5]
 
 
 def test_a_few_may_wait_and_are_worked_on_in_their_order(gate: threading.Event) -> None:
-    done: list[int] = []
-    begun = threading.Event()
-
-    def work(item: int) -> None:
-        begun.set()
-        gate.wait(10)
-        done.append(item)
-
+    work = HeldWork(gate)
     worker = Worker(work, "test", most_waiting=3)
     worker.start(lambda: None)
     worker.offer(0)
-    assert begun.wait(5)
+    assert work.begun.wait(5)
     assert [worker.offer(i) for i in range(1, 4)] == [0, 0, 0]
     assert worker.offer(4) == 3, "more than may wait: the newest alone counts"
     assert [worker.offer(i) for i in (5, 6)] == [0, 0]
-    gate.set()
-    deadline = time.monotonic() + 5
-    while len(done) < 4 and time.monotonic() < deadline:
-        time.sleep(0.005)
+    work.finish(4)
     assert worker.discard() == 0
     assert worker.stop()
-    assert done == [0, 4, 5, 6]
+    assert work.done == [0, 4, 5, 6]
 
 
 def test_preparation_runs_in_the_workers_thread_and_its_error_comes_back() -> None:
