@@ -65,7 +65,7 @@ setup(
     maintainer="crossloc3d_ros maintainers",
     maintainer_email="maintainers@crossloc3d.org",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "weights/*", "evaluation/page/*"]},
+    package_data={NAME: ["py.typed", "weights/*", "pages/assets/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -27,6 +27,9 @@ from bench.alignment import bench_alignment
 from bench.figure import Figure, median_ms
 from bench.flops import descriptor_flops
 from bench.simulation import bench_simulation
+from crossloc3d_ros.aerial_map.builder import build_map
+from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import ProgressDisplay, console, run
 from crossloc3d_ros.cli.demo import DRIVE_SURVEY, MAP_SURVEY, TOPIC, DemoDrive, find_surveys, make_drive
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
@@ -36,9 +39,6 @@ from crossloc3d_ros.encoder.model import CAMPUS, CrossLoc3D
 from crossloc3d_ros.encoder.runtime import Encoder
 from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
-from crossloc3d_ros.places.builder import build_map
-from crossloc3d_ros.places.descriptor_map import DescriptorMap
-from crossloc3d_ros.places.store import AerialMap
 
 SEARCHED = (27_520, 1_000_000)
 """Sizes of map to search besides the real one: the published dataset's, and a state's."""
@@ -188,8 +188,8 @@ def bench_search(aerial_map: AerialMap, runs: int) -> list[Figure]:
 
 def bench_node(output: Path, aerial_map: AerialMap, weights: Path | None) -> list[Figure]:
     """Play the drive at 10 Hz into the real node over DDS."""
-    from crossloc3d_ros.evaluation.estimates import read_estimates
-    from crossloc3d_ros.ros.live import localize_live
+    from crossloc3d_ros.evaluation.drives.estimates import read_estimates
+    from crossloc3d_ros.replay.live import localize_live
 
     parameters = {} if weights is None else {"weights": str(weights.resolve())}
     with open_bag(output / "drive") as bag:

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from bench.figure import Figure, median_ms
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
-from crossloc3d_ros.localization.alignment import (
+from crossloc3d_ros.localization.alignment.aligner import (
     COARSE_HEADINGS,
     COARSE_PASSAGES,
     COARSE_RETURNS,
     PEAKS_EVERYWHERE,
     Aligner,
 )
-from crossloc3d_ros.localization.evidence import Evidence, evidence_of
-from crossloc3d_ros.localization.search import search_cells
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
+from crossloc3d_ros.localization.alignment.pose_search import search_cells
 from crossloc3d_ros.types import Candidates, Hypotheses, no_candidates
 
 LARGE_KM2 = 5.5

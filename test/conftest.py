@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+
+from crossloc3d_ros.aerial_map.builder import build_map
+from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.config import (
+    AlignmentConfig,
+    BuildConfig,
+    CalibrationConfig,
+    CredibilityConfig,
+    LocalizerConfig,
+    PreprocessingConfig,
+)
+from crossloc3d_ros.localization.localizer import Localizer
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -223,8 +237,8 @@ def simulated_town(tmp_path_factory: pytest.TempPathFactory) -> object:
     Returns the pose set and the encoder of its map.
     """
     from crossloc3d_ros.config import BuildConfig
-    from crossloc3d_ros.evaluation.pose_sets import SimulatedPoses, make_pose_set
-    from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
+    from crossloc3d_ros.datasets.pose_sets import SimulatedPoses, make_pose_set
+    from crossloc3d_ros.datasets.simulated import BenchmarkTown, SimulatedBenchmark
     from crossloc3d_ros.simulation.survey import SurveyConfig
 
     poses = SimulatedPoses(
@@ -238,3 +252,39 @@ def simulated_town(tmp_path_factory: pytest.TempPathFactory) -> object:
     )  # fmt: skip
     encoder = HeightHistogram()
     return make_pose_set("town", poses, tmp_path_factory.mktemp("simulated_town"), lambda: encoder), encoder
+
+
+class RingHistogram:
+    """How many points lie how far from the centre and how high: the same from every heading."""
+
+    fingerprint = "ring-histogram"
+    descriptor_size = 80
+    preprocessing = PreprocessingConfig(
+        half_extent_m=30.0, scan_half_extent_m=30.0, n_points=2048, min_points=40, thin_m=1.0
+    )
+    calibration = CalibrationConfig(temperature=0.01, none_distance=0.2, none_scale=0.02)
+
+    def encode(self, points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        counts, _, _ = np.histogram2d(radius, points[:, 2], bins=(10, 8), range=((0, 1.0), (0, 0.8)))
+        return (counts.ravel() / max(counts.sum(), 1)).astype(np.float32)
+
+    def encode_batch(self, clouds: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+        return np.stack([self.encode(cloud) for cloud in clouds])
+
+    def warm_up(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="session")
+def town_map(town_drive, tmp_path_factory: pytest.TempPathFactory) -> AerialMap:
+    folder = tmp_path_factory.mktemp("maps") / "town"
+    build_map([town_drive.survey], folder, RingHistogram(), BuildConfig(spacing_m=10.0), geoid_separation_m=43.0)
+    return AerialMap.load(folder, RingHistogram.fingerprint)
+
+
+@pytest.fixture(scope="session")
+def localizer(town_map: AerialMap) -> Localizer:
+    """Places by retrieval alone: scans in any heading, 8 m and half a second apart, are no drive to be followed."""
+    credibility, alignment = CredibilityConfig(min_probability=0.3), AlignmentConfig(search="off")
+    return Localizer(town_map, RingHistogram(), LocalizerConfig(credibility=credibility, alignment=alignment))

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from crossloc3d_ros.aerial_map.builder import BuildReport, build_map
 from crossloc3d_ros.cli.common import (
     ProgressDisplay,
     add_options,
@@ -18,7 +19,6 @@ from crossloc3d_ros.cli.common import (
 )
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder
-from crossloc3d_ros.places.builder import BuildReport, build_map
 
 
 def main(argv: Sequence[str] | None = None) -> int:

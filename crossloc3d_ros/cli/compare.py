@@ -15,7 +15,7 @@ from rich.table import Table
 from crossloc3d_ros.cli import common
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.config import TrainConfig
-from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
+from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark
 
 if TYPE_CHECKING:
     from crossloc3d_ros.training.comparison import Comparison, Result

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.builder import read_headers
 from crossloc3d_ros.cli.common import add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.formats.las import LazWriter, expand_inputs, iter_chunks
-from crossloc3d_ros.places.builder import read_headers
 
 
 def main(argv: Sequence[str] | None = None) -> int:

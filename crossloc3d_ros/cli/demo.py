@@ -20,19 +20,19 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from crossloc3d_ros.aerial_map.builder import build_map
+from crossloc3d_ros.aerial_map.store import AerialMap, sha256
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.cli.replay import PAGE, own_version, print_results, remove_results, write_results
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import CrossLocError, MapError
-from crossloc3d_ros.evaluation.estimates import EstimateTable, write_atomically
-from crossloc3d_ros.evaluation.replay import ESTIMATES, evaluate
-from crossloc3d_ros.evaluation.report import About
-from crossloc3d_ros.evaluation.wording import UNKNOWN, degrees, metres, percent
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, write_atomically
+from crossloc3d_ros.evaluation.drives.evaluation import ESTIMATES, evaluate
+from crossloc3d_ros.evaluation.drives.page import About
 from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.places.builder import build_map
-from crossloc3d_ros.places.store import AerialMap, sha256
+from crossloc3d_ros.pages.wording import UNKNOWN, degrees, metres, percent
 from crossloc3d_ros.simulation.drive import DriveConfig, drive
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
@@ -312,7 +312,7 @@ def _clone() -> Path:
 
 def _live() -> Any:
     try:
-        from crossloc3d_ros.ros.live import localize_live
+        from crossloc3d_ros.replay.live import localize_live
     except ImportError as error:
         raise CrossLocError(
             f"ROS 2 was not found ({error}): source /opt/ros/jazzy/setup.bash, or pip install ros-jazzy-rclpy "

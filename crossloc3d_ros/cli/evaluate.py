@@ -16,27 +16,30 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.cli.replay import own_version
 from crossloc3d_ros.config import LocalizerConfig, from_dict
+from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark
+from crossloc3d_ros.datasets.place_sets import EvaluationSet
+from crossloc3d_ros.datasets.pose_drives import journeys_of, open_drives
+from crossloc3d_ros.datasets.pose_sets import POSE_SETS, open_pose_set
+from crossloc3d_ros.datasets.published import load_evaluation_set
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError, EvaluationError
-from crossloc3d_ros.evaluation import pose_results
-from crossloc3d_ros.evaluation.benchmark import BENCHMARKS, open_benchmark
-from crossloc3d_ros.evaluation.benchmark_page import PageTexts, describe, describe_briefly, write_page
-from crossloc3d_ros.evaluation.encoding import EncodingJob
-from crossloc3d_ros.evaluation.estimates import write_atomically
-from crossloc3d_ros.evaluation.gallery import gallery
-from crossloc3d_ros.evaluation.pose_drives import journeys_of, open_drives
-from crossloc3d_ros.evaluation.pose_page import write_pose_page
-from crossloc3d_ros.evaluation.pose_predictions import about_of
-from crossloc3d_ros.evaluation.pose_predictions import load_predictions as load_pose_predictions
-from crossloc3d_ros.evaluation.pose_predictions import predict as predict_poses
-from crossloc3d_ros.evaluation.pose_predictions import save_predictions as save_pose_predictions
-from crossloc3d_ros.evaluation.pose_scores import PoseScores, score_poses
-from crossloc3d_ros.evaluation.pose_sets import POSE_SETS, open_pose_set
-from crossloc3d_ros.evaluation.predictions import (
+from crossloc3d_ros.evaluation.drives.estimates import write_atomically
+from crossloc3d_ros.evaluation.poses import results as pose_results
+from crossloc3d_ros.evaluation.poses.page import write_pose_page
+from crossloc3d_ros.evaluation.poses.predictions import about_of
+from crossloc3d_ros.evaluation.poses.predictions import load_predictions as load_pose_predictions
+from crossloc3d_ros.evaluation.poses.predictions import predict as predict_poses
+from crossloc3d_ros.evaluation.poses.predictions import save_predictions as save_pose_predictions
+from crossloc3d_ros.evaluation.poses.scores import PoseScores, score_poses
+from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
+from crossloc3d_ros.evaluation.retrieval.gallery import gallery
+from crossloc3d_ros.evaluation.retrieval.page import PageTexts, describe, describe_briefly, write_page
+from crossloc3d_ros.evaluation.retrieval.predictions import (
     HEADING_MODES,
     SETTINGS,
     Plan,
@@ -46,15 +49,12 @@ from crossloc3d_ros.evaluation.predictions import (
     save_predictions,
     way_of,
 )
-from crossloc3d_ros.evaluation.published import load_evaluation_set
-from crossloc3d_ros.evaluation.results import as_csv, as_json, headline
-from crossloc3d_ros.evaluation.scan_context import ScanContext
-from crossloc3d_ros.evaluation.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
-from crossloc3d_ros.evaluation.sets import EvaluationSet
-from crossloc3d_ros.evaluation.verification import VerificationConfig, verify
-from crossloc3d_ros.places.store import AerialMap
-from crossloc3d_ros.places.workers import EncoderLoader
+from crossloc3d_ros.evaluation.retrieval.results import as_csv, as_json, headline
+from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
+from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
+from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig, verify
 from crossloc3d_ros.types import DescriptorEncoder
+from crossloc3d_ros.workers import EncoderLoader
 
 PAGE, CSV, JSON, PREDICTIONS = "index.html", "results.csv", "results.json", "predictions"
 POSE_PREDICTIONS, MARKDOWN = "predictions.npz", "table.md"

@@ -18,7 +18,7 @@ from crossloc3d_ros.cli.common import (
 )
 from crossloc3d_ros.cli.replay import read_config
 from crossloc3d_ros.config import BuildConfig, DatasetConfig, MountingConfig, PreprocessingConfig
-from crossloc3d_ros.evaluation.recording import Topics
+from crossloc3d_ros.datasets.recordings import Topics
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION
 from crossloc3d_ros.training.make_dataset import DatasetReport, DatasetRequest, make_dataset
 

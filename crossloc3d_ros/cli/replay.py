@@ -18,6 +18,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import (
     EXIT_INTERRUPTED,
     ProgressDisplay,
@@ -29,27 +30,25 @@ from crossloc3d_ros.cli.common import (
     set_up_logging,
 )
 from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig, from_dict
+from crossloc3d_ros.datasets.truth import find_truth_topic
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
-from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS
-from crossloc3d_ros.evaluation.replay import (
+from crossloc3d_ros.evaluation.drives.evaluation import (
     ESTIMATES,
     GEOJSON,
     SUMMARY,
     Evaluation,
-    OdometrySource,
     evaluate,
     latency_summary,
-    localize_bag,
     write_summary,
 )
-from crossloc3d_ros.evaluation.report import About, write_report
-from crossloc3d_ros.evaluation.track_scores import LOST, TrackScores
-from crossloc3d_ros.evaluation.truth import find_truth_topic
-from crossloc3d_ros.evaluation.wording import degrees, metres, percent
+from crossloc3d_ros.evaluation.drives.page import About, write_report
+from crossloc3d_ros.evaluation.drives.track_scores import LOST, TrackScores
+from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.pages.wording import degrees, metres, percent
+from crossloc3d_ros.replay.recorded import OdometrySource, localize_bag
 from crossloc3d_ros.types import Estimate
 
 PAGE = "index.html"

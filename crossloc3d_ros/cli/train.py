@@ -120,8 +120,8 @@ def _parser() -> argparse.ArgumentParser:
 def _alignment(arguments: argparse.Namespace) -> int:
     import functools
 
+    from crossloc3d_ros.datasets.pose_sets import open_pose_set
     from crossloc3d_ros.encoder.checkpoint import load_encoder
-    from crossloc3d_ros.evaluation.pose_sets import open_pose_set
     from crossloc3d_ros.training.alignment import fit_alignment
 
     target = common.console()
@@ -142,8 +142,8 @@ def _verification(arguments: argparse.Namespace) -> int:
     import functools
 
     from crossloc3d_ros.encoder.checkpoint import load_encoder
-    from crossloc3d_ros.evaluation.encoding import EncodingJob
-    from crossloc3d_ros.evaluation.verification import VerificationConfig
+    from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
+    from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig
     from crossloc3d_ros.training.material import read_material
     from crossloc3d_ros.training.verification import RADII_M, fit_verification
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from crossloc3d_ros.clouds.filters import levelling_matrix
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization import credibility, tracking
+from crossloc3d_ros.localization.fusion import tracking
+from crossloc3d_ros.localization.retrieval import place_belief as credibility
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,

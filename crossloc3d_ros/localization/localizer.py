@@ -7,16 +7,16 @@ from collections.abc import Callable
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
-from crossloc3d_ros.localization.alignment import Aligner, moved
-from crossloc3d_ros.localization.credibility import effective_calibration, judge
+from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
-from crossloc3d_ros.localization.odometry import Motion
-from crossloc3d_ros.localization.retrieval import encode_query, retrieve
-from crossloc3d_ros.localization.tracking import PosePrior, Tracker
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.localization.fusion.odometry import Motion
+from crossloc3d_ros.localization.fusion.tracking import PosePrior, Tracker
+from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
+from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration, judge
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,

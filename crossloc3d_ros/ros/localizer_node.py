@@ -38,16 +38,16 @@ from sensor_msgs.msg import Imu, NavSatFix, PointCloud2
 from std_srvs.srv import Empty
 from visualization_msgs.msg import MarkerArray
 
+from crossloc3d_ros.aerial_map.store import AerialMap, read_manifest
 from crossloc3d_ros.clouds.filters import mounting_matrix, transform_points
 from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.errors import CloudError, ConfigError, CrossLocError, PoseError
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.gravity import GravityFilter
+from crossloc3d_ros.localization.fusion.gravity import GravityFilter
+from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
+from crossloc3d_ros.localization.fusion.tracking import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
-from crossloc3d_ros.localization.odometry import Motion, OdometryBuffer, ScanOdometry
-from crossloc3d_ros.localization.tracking import PosePrior
-from crossloc3d_ros.places.store import AerialMap, read_manifest
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,
     candidates_message,

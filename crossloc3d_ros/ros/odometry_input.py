@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from crossloc3d_ros.errors import CrossLocError, PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
-from crossloc3d_ros.localization.odometry import Motion, OdometryBuffer
+from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer
 from crossloc3d_ros.ros.poses import stamp_of
 from crossloc3d_ros.types import Float64Array
 

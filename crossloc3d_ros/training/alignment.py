@@ -15,16 +15,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, PreprocessingConfig, ScanConfig
+from crossloc3d_ros.datasets.pose_sets import PoseSet
+from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.evaluation.pose_sets import PoseSet
-from crossloc3d_ros.evaluation.raw_scans import RawScan
-from crossloc3d_ros.localization.alignment import Aligner, fine_counts
-from crossloc3d_ros.localization.evidence import CHANNELS, Evidence, evidence_of
-from crossloc3d_ros.localization.likelihood import MapLikelihood
-from crossloc3d_ros.localization.observation_model import CLASSES, OPEN_GROUND, ObservationModel, fit_log_ratios
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.localization.alignment.aligner import Aligner, fine_counts
+from crossloc3d_ros.localization.alignment.evidence import CHANNELS, Evidence, evidence_of
+from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
+from crossloc3d_ros.localization.alignment.observation_model import (
+    CLASSES,
+    OPEN_GROUND,
+    ObservationModel,
+    fit_log_ratios,
+)
 from crossloc3d_ros.types import AlignedPoses, Float64Array, no_candidates
 
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)

@@ -19,11 +19,13 @@ from typing import Any, Literal, get_args
 import torch
 
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig, from_dict, to_dict, usable_threads
+from crossloc3d_ros.datasets.place_sets import EvaluationSet
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.encoder.networks import PUBLISHED, make_network
 from crossloc3d_ros.errors import ConfigError, CrossLocError, TrainingError
-from crossloc3d_ros.evaluation.encoding import EncodingJob, time_queries
-from crossloc3d_ros.evaluation.predictions import (
+from crossloc3d_ros.evaluation.recall import Share
+from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob, time_queries
+from crossloc3d_ros.evaluation.retrieval.predictions import (
     Plan,
     Predictions,
     load_predictions,
@@ -31,17 +33,15 @@ from crossloc3d_ros.evaluation.predictions import (
     save_predictions,
     way_of,
 )
-from crossloc3d_ros.evaluation.recall import Share
-from crossloc3d_ros.evaluation.scan_context import HeightMaps, ScanContext
-from crossloc3d_ros.evaluation.scores import difference, score
-from crossloc3d_ros.evaluation.sets import EvaluationSet
-from crossloc3d_ros.places.workers import EncoderLoader
+from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
+from crossloc3d_ros.evaluation.retrieval.scores import difference, score
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loop import Progress, Trainer
 from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.schedule import Budget
 from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.types import DescriptorEncoder
+from crossloc3d_ros.workers import EncoderLoader
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
-from crossloc3d_ros.evaluation.estimates import write_atomically
+from crossloc3d_ros.evaluation.drives.estimates import write_atomically
 from crossloc3d_ros.training.comparison import RADII_M, RANKS, Result
 
 CSV, MARKDOWN, HTML = "comparison.csv", "comparison.md", "comparison.html"
@@ -75,7 +75,7 @@ def as_html(results: Sequence[Result], texts: TableTexts) -> str:
     """Return the table as a page that needs nothing but itself."""
     head, *body = _cells(results)
     best = max((result.cell(1, 100.0).recall for result in results), default=0.0)
-    style = (resources.files("crossloc3d_ros.evaluation") / "page" / "page.css").read_text(encoding="utf-8")
+    style = (resources.files("crossloc3d_ros.pages") / "assets" / "page.css").read_text(encoding="utf-8")
     rows = []
     for result, cells in zip(results, body, strict=True):
         width = 100.0 * result.cell(1, 100.0).recall

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.evaluation import charts
+from crossloc3d_ros.pages import charts
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.types import Float64Array
@@ -77,7 +77,7 @@ def curve_page(folder: Path, *, live: bool = False) -> str:
 
 
 def _style() -> str:
-    pages = resources.files("crossloc3d_ros.evaluation") / "page"
+    pages = resources.files("crossloc3d_ros.pages") / "assets"
     return "".join((pages / name).read_text(encoding="utf-8") for name in ("page.css", "benchmark.css"))
 
 

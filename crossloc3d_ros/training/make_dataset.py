@@ -24,10 +24,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from crossloc3d_ros import __version__
+from crossloc3d_ros.aerial_map.aerial_patches import AerialPatches, cut_aerial
+from crossloc3d_ros.aerial_map.builder import read_headers
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import BuildConfig, DatasetConfig, PreprocessingConfig, ScanConfig, to_dict
+from crossloc3d_ros.datasets.recordings import RecordedScans, Topics, find_topics, read_scans
 from crossloc3d_ros.errors import DatasetError
-from crossloc3d_ros.evaluation.recording import RecordedScans, Topics, find_topics, read_scans
 from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.formats.cs_campus3d import (
     PRESETS,
@@ -41,8 +43,6 @@ from crossloc3d_ros.formats.cs_campus3d import (
     write_training,
 )
 from crossloc3d_ros.formats.las import expand_inputs
-from crossloc3d_ros.places.aerial_patches import AerialPatches, cut_aerial
-from crossloc3d_ros.places.builder import read_headers
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION, Areas, Roles, cut_areas
 from crossloc3d_ros.types import Int64Array
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import TrainConfig
+from crossloc3d_ros.datasets.place_sets import PlaceSet
+from crossloc3d_ros.datasets.published import PatchSource, load_evaluation_set, open_source, place_set
 from crossloc3d_ros.errors import DatasetError, TrainingError
-from crossloc3d_ros.evaluation.published import PatchSource, load_evaluation_set, open_source, place_set
-from crossloc3d_ros.evaluation.sets import PlaceSet
 from crossloc3d_ros.formats.cs_campus3d import INFO, CloudTable, Preset, TrainingTuples, preset_of, read_training
 from crossloc3d_ros.training.areas import TRAINING, VALIDATION, Roles, cut_areas
 from crossloc3d_ros.training.augmentation import heading_error, occlude, paper_batch, paper_cloud

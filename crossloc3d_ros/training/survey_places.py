@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.store import sha256
 from crossloc3d_ros.config import PlacesConfig, PreprocessingConfig, to_dict
 from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.formats.las import expand_inputs
-from crossloc3d_ros.places.store import sha256
 from crossloc3d_ros.simulation.real_world import LocalSurvey, read_survey, world_from_points
 from crossloc3d_ros.training.places import SURFACE_CLEARANCE_M, Made, above_terrain, already_made, training_town
 from crossloc3d_ros.training.shards import TRAINING, Manifest, TownEntry, write_manifest, write_town

@@ -11,8 +11,8 @@ import numpy as np
 from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import CalibrationConfig
 from crossloc3d_ros.evaluation.recall import chance_of_hit, wilson_share
-from crossloc3d_ros.localization.credibility import calibrate
-from crossloc3d_ros.localization.retrieval import heading_angles
+from crossloc3d_ros.localization.retrieval.candidates import heading_angles
+from crossloc3d_ros.localization.retrieval.place_belief import calibrate
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet, join_sets
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.evaluation.encoding import EncodingJob
-from crossloc3d_ros.evaluation.predictions import Plan, metres_of, predict_all, way_of
-from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet, join_sets
-from crossloc3d_ros.evaluation.verification import compare, scores_of, temperature_of
+from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
+from crossloc3d_ros.evaluation.retrieval.predictions import Plan, metres_of, predict_all, way_of
+from crossloc3d_ros.evaluation.retrieval.verification import compare, scores_of, temperature_of
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli import build_map, cut_survey
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.formats.las import iter_chunks, read_header, write_laz
-from crossloc3d_ros.places.store import AerialMap
 
 MAPS = Path(__file__).resolve().parents[2] / "maps"
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from crossloc3d_ros.cli import demo
 from crossloc3d_ros.errors import MapError
-from crossloc3d_ros.evaluation.estimates import EstimateTable, no_pose_lists
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, no_pose_lists
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import TrackState
 

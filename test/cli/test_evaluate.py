@@ -17,13 +17,12 @@ from safetensors.numpy import save_file
 
 from crossloc3d_ros.cli import evaluate
 from crossloc3d_ros.config import BuildConfig, CalibrationConfig
-from crossloc3d_ros.evaluation import benchmark as benchmarks
-from crossloc3d_ros.evaluation import pose_drives, pose_sets
-from crossloc3d_ros.evaluation.amsterdam import AmsterdamBenchmark
-from crossloc3d_ros.evaluation.pose_drives import DrivePlan
-from crossloc3d_ros.evaluation.pose_sets import SimulatedPoses
-from crossloc3d_ros.evaluation.predictions import load_predictions, save_predictions
-from crossloc3d_ros.evaluation.simulated import BenchmarkTown, SimulatedBenchmark
+from crossloc3d_ros.datasets import benchmarks, pose_drives, pose_sets
+from crossloc3d_ros.datasets.amsterdam import AmsterdamBenchmark
+from crossloc3d_ros.datasets.pose_drives import DrivePlan
+from crossloc3d_ros.datasets.pose_sets import SimulatedPoses
+from crossloc3d_ros.datasets.simulated import BenchmarkTown, SimulatedBenchmark
+from crossloc3d_ros.evaluation.retrieval.predictions import load_predictions, save_predictions
 from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS, write_cloud
 from crossloc3d_ros.simulation.survey import SurveyConfig
 

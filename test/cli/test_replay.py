@@ -46,9 +46,9 @@ class Installation:
 def installed(town_drive, tmp_path_factory: pytest.TempPathFactory) -> Installation:
     import torch
 
+    from crossloc3d_ros.aerial_map.builder import build_map
     from crossloc3d_ros.encoder.checkpoint import load_encoder, save_checkpoint
     from crossloc3d_ros.encoder.model import CrossLoc3D
-    from crossloc3d_ros.places.builder import build_map
 
     folder = tmp_path_factory.mktemp("installed")
     torch.manual_seed(0)

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
+from crossloc3d_ros.aerial_map.geotiff import write_geotiff
+from crossloc3d_ros.aerial_map.store import AerialMap, BuildCounts, Manifest, SubmapTable
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.places.descriptor_map import DescriptorMap
-from crossloc3d_ros.places.geotiff import write_geotiff
-from crossloc3d_ros.places.store import AerialMap, BuildCounts, Manifest, SubmapTable
 from crossloc3d_ros.types import Float32Array, Float64Array, ScanCounts
 
 CRS = "EPSG:32631"

@@ -21,18 +21,18 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
+from crossloc3d_ros.aerial_map.geotiff import write_geotiff
+from crossloc3d_ros.aerial_map.store import TERRAIN, AerialMap
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import LocalizerConfig
+from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
+from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.errors import CloudError, MapError
-from crossloc3d_ros.evaluation.pose_sets import PoseSet, placed_town
-from crossloc3d_ros.evaluation.simulated import BenchmarkTown
-from crossloc3d_ros.localization.gravity import GravityFilter
+from crossloc3d_ros.localization.alignment.pose_search import wrapped
+from crossloc3d_ros.localization.fusion.gravity import GravityFilter
+from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
+from crossloc3d_ros.localization.fusion.tracking import RIGHT_WITHIN_M, PosePrior
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
-from crossloc3d_ros.localization.odometry import OdometryBuffer
-from crossloc3d_ros.localization.search import wrapped
-from crossloc3d_ros.localization.tracking import RIGHT_WITHIN_M, PosePrior
-from crossloc3d_ros.places.geotiff import write_geotiff
-from crossloc3d_ros.places.store import TERRAIN, AerialMap
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.types import BoolArray, Estimate, FixStatus, Float32Array, Float64Array, Scan, TrackState

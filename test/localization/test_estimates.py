@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization import credibility, tracking
 from crossloc3d_ros.localization.estimates import (
     HEIGHT_STD_M,
     TILT_STD_RAD,
@@ -19,6 +18,8 @@ from crossloc3d_ros.localization.estimates import (
     placed_estimate,
     posed_estimate,
 )
+from crossloc3d_ros.localization.fusion import tracking
+from crossloc3d_ros.localization.retrieval import place_belief as credibility
 from crossloc3d_ros.types import (
     Estimate,
     FixStatus,

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
+from crossloc3d_ros.aerial_map.store import AerialMap, BuildCounts, Manifest, SubmapTable
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import (
     AlignmentConfig,
@@ -20,15 +22,13 @@ from crossloc3d_ros.config import (
     LocalizerConfig,
     PreprocessingConfig,
 )
-from crossloc3d_ros.evaluation.pose_sets import PoseSet, placed_town
-from crossloc3d_ros.evaluation.raw_scans import RawScan
-from crossloc3d_ros.evaluation.simulated import BenchmarkTown
+from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
+from crossloc3d_ros.datasets.raw_scans import RawScan
+from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.localization.alignment.pose_search import wrapped
+from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.localizer import Localizer, Looks
-from crossloc3d_ros.localization.odometry import Motion
-from crossloc3d_ros.localization.search import wrapped
-from crossloc3d_ros.places.descriptor_map import DescriptorMap
-from crossloc3d_ros.places.store import AerialMap, BuildCounts, Manifest, SubmapTable
 from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 

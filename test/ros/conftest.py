@@ -36,15 +36,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Imu, NavSatFix, PointCloud2, PointField
 from visualization_msgs.msg import MarkerArray
 
+from crossloc3d_ros.aerial_map import store
+from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
+from crossloc3d_ros.aerial_map.geotiff import write_geotiff
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import BuildConfig, LocalizerConfig, ModelConfig, PreprocessingConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder, save_checkpoint
 from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.formats.pointcloud2 import pack_columns
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.places import store
-from crossloc3d_ros.places.descriptor_map import DescriptorMap
-from crossloc3d_ros.places.geotiff import write_geotiff
 from crossloc3d_ros.ros.conversions import header_message
 from crossloc3d_ros.ros.shared_memory import prepare_for_large_clouds
 from crossloc3d_ros.types import Scan

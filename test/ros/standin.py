@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli import common
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import LocalizerNodeConfig
-from crossloc3d_ros.localization.credibility import effective_calibration
 from crossloc3d_ros.localization.localizer import no_estimate
-from crossloc3d_ros.localization.retrieval import encode_query, retrieve
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
+from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration
 from crossloc3d_ros.types import EXHAUSTIVE, AlignedPoses, Estimate, FixStatus, Hypotheses, Scan, TrackState
 
 HEADING_RAD = 0.5

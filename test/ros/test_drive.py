@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from crossloc3d_ros.aerial_map.builder import build_map
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.encoder.checkpoint import load_encoder
-from crossloc3d_ros.evaluation.estimates import EstimateTable, read_estimates
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, read_estimates
 from crossloc3d_ros.formats import bag
-from crossloc3d_ros.places.builder import build_map
-from crossloc3d_ros.places.store import AerialMap
-from crossloc3d_ros.ros.live import localize_live
+from crossloc3d_ros.replay.live import localize_live
 from crossloc3d_ros.simulation.drive import DriveConfig, drive
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly, write_survey

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import CrossLocError
-from crossloc3d_ros.evaluation.estimates import read_estimates
+from crossloc3d_ros.evaluation.drives.estimates import read_estimates
 from crossloc3d_ros.formats import bag
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.replay.live import header_stamp_ns, localize_live
 from crossloc3d_ros.ros.conversions import in_grid
-from crossloc3d_ros.ros.live import header_stamp_ns, localize_live
 from crossloc3d_ros.types import TrackState
 
 START_NS = 1_700_000_000_000_000_000

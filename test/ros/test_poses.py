@@ -25,8 +25,8 @@ from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import CloudError, ConfigError, PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
 from crossloc3d_ros.localization.localizer import no_estimate
-from crossloc3d_ros.localization.odometry import OdometryBuffer
 from crossloc3d_ros.ros import conversions
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import AlignmentConfig
+from crossloc3d_ros.datasets.pose_sets import PoseSet
+from crossloc3d_ros.datasets.raw_scans import RawScans
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.evaluation.pose_sets import PoseSet
-from crossloc3d_ros.evaluation.raw_scans import RawScans
-from crossloc3d_ros.localization.alignment import Aligner
-from crossloc3d_ros.localization.evidence import CHANNELS, LAYERS
-from crossloc3d_ros.localization.observation_model import CLASSES, UNKNOWN, ObservationModel
-from crossloc3d_ros.places.store import AerialMap
+from crossloc3d_ros.localization.alignment.aligner import Aligner
+from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS
+from crossloc3d_ros.localization.alignment.observation_model import CLASSES, UNKNOWN, ObservationModel
 from crossloc3d_ros.training.alignment import (
     RIGHT_M,
     RIGHT_RAD,

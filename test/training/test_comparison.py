@@ -13,13 +13,13 @@ import pytest
 
 from crossloc3d_ros.cli import compare
 from crossloc3d_ros.config import TrainConfig, to_dict
+from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.encoder.checkpoint import load_checkpoint
 from crossloc3d_ros.encoder.networks import make_network
 from crossloc3d_ros.errors import ConfigError, TrainingError
-from crossloc3d_ros.evaluation.predictions import load_predictions
 from crossloc3d_ros.evaluation.recall import Share
-from crossloc3d_ros.evaluation.scores import score
-from crossloc3d_ros.evaluation.sets import EvaluationSet, PlaceSet
+from crossloc3d_ros.evaluation.retrieval.predictions import load_predictions
+from crossloc3d_ros.evaluation.retrieval.scores import score
 from crossloc3d_ros.training import comparison
 from crossloc3d_ros.training.comparison import TABLES, Comparison, Result, Row, rows_of, select
 from crossloc3d_ros.training.comparison_table import (

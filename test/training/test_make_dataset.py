@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crossloc3d_ros.aerial_map import aerial_patches
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import (
     BuildConfig,
@@ -22,12 +23,11 @@ from crossloc3d_ros.config import (
     PreprocessingConfig,
     TrainConfig,
 )
+from crossloc3d_ros.datasets.published import load_evaluation_set
+from crossloc3d_ros.datasets.recordings import Topics
 from crossloc3d_ros.errors import AerialDataError, BagError, DatasetError, TrainingError
-from crossloc3d_ros.evaluation.published import load_evaluation_set
-from crossloc3d_ros.evaluation.recording import Topics
 from crossloc3d_ros.formats import cs_campus3d
 from crossloc3d_ros.formats.cs_campus3d import PRESETS, read_evaluation, read_info, read_training
-from crossloc3d_ros.places import aerial_patches
 from crossloc3d_ros.training import make_dataset as module
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION
 from crossloc3d_ros.training.make_dataset import BORDER, NO_SUBMAP, DatasetReport, DatasetRequest, make_dataset

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
+from crossloc3d_ros.datasets.published import open_source
 from crossloc3d_ros.errors import DatasetError, TrainingError
-from crossloc3d_ros.evaluation.published import open_source
 from crossloc3d_ros.formats.cs_campus3d import (
     PRESETS,
     CloudTable,

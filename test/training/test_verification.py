@@ -13,7 +13,7 @@ from scipy.special import softmax
 from crossloc3d_ros.cli import train
 from crossloc3d_ros.config import CalibrationConfig, PlacesConfig, PreprocessingConfig
 from crossloc3d_ros.errors import EvaluationError, TrainingError
-from crossloc3d_ros.evaluation.encoding import EncodingJob
+from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
 from crossloc3d_ros.training.places import make_town_places, plan_towns
 from crossloc3d_ros.training.shards import ValidationTown, read_validation_town
 from crossloc3d_ros.training.verification import evaluation_set_of, fit_verification, fit_weight

@@ -1,0 +1,1 @@
+"""One replayed drive: estimates on disk, scores along the track, the page."""

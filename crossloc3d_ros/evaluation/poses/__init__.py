@@ -1,0 +1,1 @@
+"""Poses: single scans and drives of the pose benchmark, predicted, scored, shown."""

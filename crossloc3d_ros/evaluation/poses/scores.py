@@ -1,0 +1,506 @@
+"""From answers to the figures of the pose benchmark: pure functions over `PosePredictions`.
+
+What is counted is said at each measure. Intervals are those of `scores`: a bootstrap over towns, or over squares of
+50 m where fewer than eight towns were asked; a share's interval is widened to hold Wilson's for as many trials as there
+are places 25 m apart, so that nothing wrong in a few trials is no proof of anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from crossloc3d_ros.evaluation.poses.predictions import SINGLE, PoseAbout, PosePredictions, number_of_alone, select
+from crossloc3d_ros.evaluation.recall import independent_places, squared_mahalanobis
+from crossloc3d_ros.evaluation.retrieval.scores import bootstrap_draws, clusters_among, share_of
+from crossloc3d_ros.simulation.families import HELD_OUT_FAMILIES
+from crossloc3d_ros.types import EXHAUSTIVE, BoolArray, Float64Array, Int64Array
+
+WITHIN_M, WITHIN_DEG = 2.0, 5.0
+"""A pose that is at most so far from the truth is right."""
+WRONG_M = 10.0
+"""A fix farther from the truth is wrong."""
+AMONG_M = 50.0
+"""A scan's place is among the candidates where one of their centres is so near: the submap holds the robot."""
+SIGMAS = np.linspace(0.0, 4.0, 41)
+_TWO_SIGMA = 0.9545
+_BINS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99, 0.999, 0.9999, 1.0])
+"""Of believed probabilities; fine where it matters."""
+
+Unit = Literal["%", "m", "degrees", "fixes", "ms"]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure with its interval, and what was wanted of it."""
+
+    key: str
+    text: str
+    unit: Unit
+    value: float
+    """A share lies between 0 and 1; infinite: not within the drive; NaN: nothing was asked."""
+    low: float
+    high: float
+    count: int
+    """Of what it is a figure: scans, fixes, drives."""
+    counted: str
+    """Their name."""
+    floor: float | None = None
+    """Worse than this is not enough; the second number of a range is `ceiling`."""
+    goal: float | None = None
+    floor_high: float | None = None
+    goal_high: float | None = None
+    higher_is_better: bool = True
+
+    @property
+    def verdict(self) -> Literal["goal", "floor", "below", ""]:
+        """Say which of goal and floor the value reaches; empty where there is neither."""
+        if self.goal is None or math.isnan(self.value):
+            return ""
+        for name, low, high in (("goal", self.goal, self.goal_high), ("floor", self.floor, self.floor_high)):
+            if low is None:
+                continue
+            if high is not None:
+                reached = low <= self.value <= high
+            else:
+                reached = self.value >= low if self.higher_is_better else self.value <= low
+            if reached:
+                return "goal" if name == "goal" else "floor"
+        return "below"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What the answers are worth up to one stage of the chain, on the same scans."""
+
+    name: str
+    scans: int
+    within: float
+    """Share within 2 m and 5 degrees."""
+    within_low: float
+    within_high: float
+    within_10_m: float
+    within_50_m: float
+    median_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What is believed against what is true."""
+
+    name: str
+    believed: Float64Array
+    """(B,) mean of the probabilities in each bin that holds any."""
+    right: Float64Array
+    """(B,) share of them that was right."""
+    count: Int64Array
+    """(B,)"""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseScores:
+    """Everything that predictions are worth."""
+
+    about: PoseAbout
+    measures: tuple[Measure, ...]
+    stages: tuple[Stage, ...]
+    """Of the single scans on the map."""
+    drive_stages: tuple[Stage, ...]
+    """Of scans along drives, alone and with all that came before."""
+    families: tuple[Measure, ...]
+    """One scan end to end, by families seen and held out, then by family."""
+    calibrations: tuple[Calibration, ...]
+    inside: dict[str, Float64Array]
+    """(41,) share of the errors inside of k sigma, k in `SIGMAS`, by what they are errors of."""
+    errors_m: dict[str, Float64Array]
+    """Horizontal errors of the single scans by stage, and of the fixes along drives; infinite where there is no
+    answer."""
+
+    def measure(self, key: str) -> Measure:
+        """Return one figure."""
+        for each in (*self.measures, *self.families):
+            if each.key == key:
+                return each
+        raise KeyError(key)
+
+
+def score_poses(predictions: PosePredictions, about: PoseAbout) -> PoseScores:
+    """Score predictions."""
+    on_map = np.array(about.on_map, np.bool_)[predictions.area]
+    single = predictions.journey == SINGLE
+    driven = predictions.journey >= 0
+    singles = select(predictions, single & on_map)
+    track = select(predictions, driven & on_map)
+    away = select(predictions, (driven | single) & ~on_map)
+    asked = select(predictions, driven | single)
+    after = select(track, localized_before(track) & track.has_fix)
+    goals = _goals(about)
+    measures = (
+        *_single_measures(singles, goals),
+        *_way_measures(track, goals),
+        *_after_measures(track, after, goals),
+        _wrong_measure(asked, goals),
+        _sigma_measure(after, goals),
+        *_away_measures(away, select(away, away.journey >= 0), goals),
+        *_time_measures(predictions),
+    )
+    stages = {name: answer(singles) for name, answer in STAGES.items()}
+    fused = {"single, " + name: _distance(singles, answer) for name, answer in stages.items()}
+    return PoseScores(
+        about=about,
+        measures=measures,
+        stages=tuple(_stage(name, singles, answer) for name, answer in stages.items()),
+        drive_stages=_drive_stages(predictions, on_map),
+        families=_family_measures(singles, about),
+        calibrations=_calibrations(singles, track, away),
+        inside=_inside_curves(after),
+        errors_m={**fused, "drive, fixes once localized": error_m(after)},
+    )
+
+
+def error_m(predictions: PosePredictions) -> Float64Array:
+    """Return the horizontal error (N,) of the localizer's pose, infinite where there is none."""
+    return _distance(predictions, predictions.pose[:, [0, 1, 3]])
+
+
+def error_deg(predictions: PosePredictions) -> Float64Array:
+    """Return the error (N,) of the localizer's heading, infinite where there is none."""
+    return _turn_deg(predictions, predictions.pose[:, [0, 1, 3]])
+
+
+def _distance(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
+    metres = np.hypot(answer[:, 0] - predictions.truth[:, 0], answer[:, 1] - predictions.truth[:, 1])
+    return np.where(np.isfinite(metres), metres, np.inf)
+
+
+def _turn_deg(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
+    turn = answer[:, 2] - predictions.truth[:, 3]
+    degrees = np.degrees(np.abs(np.arctan2(np.sin(turn), np.cos(turn))))
+    return np.where(np.isfinite(degrees), degrees, np.inf)
+
+
+def is_right(predictions: PosePredictions, answer: Float64Array) -> BoolArray:
+    """Say (N,) of answers (N, 3) easting, northing, heading whether they are within 2 m and 5 degrees."""
+    near = _distance(predictions, answer) <= WITHIN_M
+    return np.asarray(near & (_turn_deg(predictions, answer) <= WITHIN_DEG), np.bool_)
+
+
+def retrieved(predictions: PosePredictions) -> Float64Array:
+    """Return the first candidate (N, 3); retrieval knows no heading."""
+    place = predictions.candidates[:, 0]
+    return np.column_stack([place, np.full(len(place), np.nan)])
+
+
+def first_aligned(predictions: PosePredictions) -> Float64Array:
+    """Return the best pose (N, 3) within 50 m of the foremost candidate that has one so near."""
+    source = predictions.aligned_source
+    own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == EXHAUSTIVE))
+    answer = np.full((len(predictions), 3), np.nan)
+    for place in np.moveaxis(predictions.candidates, 1, 0)[::-1]:  # the foremost last: it has the last word
+        offsets = predictions.aligned[:, :, :2] - place[:, None, :]
+        near = own & (np.hypot(offsets[:, :, 0], offsets[:, :, 1]) <= AMONG_M)
+        has = near.any(axis=1)
+        answer[has] = predictions.aligned[has, near[has].argmax(axis=1)]
+    return answer
+
+
+def best_aligned(predictions: PosePredictions) -> Float64Array:
+    """Return the pose (N, 3) that fits best of all."""
+    return predictions.aligned[:, 0]
+
+
+def whole_map_share(predictions: PosePredictions) -> float:
+    """Return the share of the scans whose best pose a search of the whole map has found."""
+    found = np.isfinite(predictions.aligned[:, 0, 0])
+    return float(np.mean(predictions.aligned_source[found, 0] == EXHAUSTIVE)) if found.any() else math.nan
+
+
+STAGES: dict[str, Callable[[PosePredictions], Float64Array]] = {
+    "retrieval alone": retrieved,
+    "+ alignment": first_aligned,
+    "+ re-ranking": best_aligned,
+}
+
+
+def localized_before(track: PosePredictions) -> BoolArray:
+    """Say (N,) of the scans of journeys, in their order, whether a right fix was given in the same leg until then."""
+    right = track.has_fix & (error_m(track) <= WRONG_M)
+    known = np.zeros(len(track), np.bool_)
+    for rows in _legs(track):
+        known[rows] = np.logical_or.accumulate(right[rows])
+    return known
+
+
+def _legs(track: PosePredictions) -> list[Int64Array]:
+    """Return the rows of each leg."""
+    if not len(track):
+        return []
+    keys = np.column_stack([track.journey, track.leg])
+    number = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    return [np.flatnonzero(number == i) for i in range(number.max() + 1)]
+
+
+def _clusters(predictions: PosePredictions) -> Int64Array:
+    return clusters_among(predictions.area, predictions.truth[:, :2])
+
+
+def _places(predictions: PosePredictions) -> int:
+    return sum(independent_places(predictions.truth[predictions.area == area]) for area in np.unique(predictions.area))
+
+
+def _share(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: _Goals) -> Measure:
+    share = share_of(hit, _clusters(of), _places(of))
+    return goals.measure(key, text, "%", share.value, share.low, share.high, len(hit), counted)
+
+
+def _quantile(
+    key: str, text: str, unit: Unit, values: Float64Array, of: PosePredictions, q: float, counted: str, goals: _Goals
+) -> Measure:
+    value, low, high = quantile_interval(values, _clusters(of), q)
+    return goals.measure(key, text, unit, value, low, high, len(values), counted)
+
+
+def quantile_interval(values: Float64Array, clusters: Int64Array, q: float) -> tuple[float, float, float]:
+    """Return a quantile of values (N,), which may be infinite, and its interval when whole clusters are drawn."""
+    if not len(values):
+        return math.nan, math.nan, math.nan
+    numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(values, kind="stable")
+    ordered, drawn = values[order], bootstrap_draws(int(numbers.max()) + 1)[:500]
+    reached = np.cumsum(drawn[:, numbers[order]], axis=1)
+    totals = reached[:, -1]
+    chosen = (reached < q * totals[:, None]).sum(axis=1)
+    resampled = np.sort(ordered[np.minimum(chosen, len(ordered) - 1)])
+    plain = ordered[min(math.ceil(q * len(ordered)) - 1 if q > 0 else 0, len(ordered) - 1)]
+    middle = float(np.median(values)) if q == 0.5 and np.isfinite(values).all() else float(plain)
+    low, high = resampled[int(0.025 * len(resampled))], resampled[min(int(0.975 * len(resampled)), len(resampled) - 1)]
+    return middle, min(float(low), middle), max(float(high), middle)
+
+
+@dataclass(frozen=True)
+class _Goals:
+    """What is wanted of each measure: floor, goal, and the upper ends where they are ranges."""
+
+    wanted: dict[str, tuple[float | None, float, float | None, float | None, bool]]
+
+    def measure(
+        self, key: str, text: str, unit: Unit, value: float, low: float, high: float, count: int, counted: str
+    ) -> Measure:
+        if key not in self.wanted:
+            return Measure(key, text, unit, value, low, high, count, counted)
+        floor, goal, floor_high, goal_high, higher = self.wanted[key]
+        return Measure(key, text, unit, value, low, high, count, counted, floor, goal, floor_high, goal_high, higher)
+
+
+def _goals(about: PoseAbout) -> _Goals:
+    real = about.pose_set == "amsterdam"
+    at_least: dict[str, tuple[float, float]] = {"end_to_end": (0.60, 0.90) if real else (0.80, 0.97)}
+    if not real:
+        at_least["among"] = (0.95, 0.995)
+    at_most: dict[str, tuple[float | None, float]] = {
+        "until_median": (60.0, 15.0),
+        "until_95": (None, 60.0),
+        "after_median": (1.0, 0.3),
+        "after_95": (3.0, 1.0),
+        "heading_median": (1.0, 0.3),
+        "heading_95": (4.0, 1.0),
+        "wrong": (0.005, 0.0005),
+        "carried_median": (100.0, 20.0),
+        "away_fixes": (0.0, 0.0),
+    }
+    return _Goals(
+        {key: (floor, goal, None, None, True) for key, (floor, goal) in at_least.items()}
+        | {key: (floor, goal, None, None, False) for key, (floor, goal) in at_most.items()}
+        | {"inside_2_sigma": (0.90, 0.94, 0.99, 0.97, True)}
+    )
+
+
+def _single_measures(singles: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+    nearest = np.hypot(*np.moveaxis(singles.candidates - singles.truth[:, None, :2], 2, 0))
+    among = select(singles, np.asarray((nearest <= AMONG_M).any(axis=1), np.bool_))
+    pose = f"pose within {WITHIN_M:g} m and {WITHIN_DEG:g}°"
+    found = np.asarray((nearest <= AMONG_M).any(axis=1), np.bool_)
+    return (
+        _share("among", f"one scan, no prior: {pose}, of the scans whose true place is among the 25 candidates",
+               is_right(among, best_aligned(among)), among, "scans", goals),
+        _share("end_to_end", f"one scan, no prior, end to end: {pose}",
+               is_right(singles, best_aligned(singles)), singles, "scans", goals),
+        _share("place_found", f"… the true place is among the 25 candidates (a centre within {AMONG_M:g} m)",
+               found, singles, "scans", goals),
+    )  # fmt: skip
+
+
+def _way_measures(track: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+    legs = _legs(track)
+    right = track.has_fix & (error_m(track) <= WRONG_M)
+    measures = []
+    for key, text, carried in (
+        ("until", "travelled until localized, from nothing", False),
+        ("carried", "carried away while running: recovered after", True),
+    ):
+        chosen = [rows for rows in legs if (track.leg[rows[0]] > 0) == carried]
+        ways = np.array([track.travelled_m[rows[right[rows].argmax()]] if right[rows].any() else np.inf
+                         for rows in chosen])  # fmt: skip
+        first = select(track, np.array([rows[0] for rows in chosen], np.int64))
+        measures += [
+            _quantile(f"{key}_median", f"{text}, median", "m", ways, first, 0.5, "drives", goals),
+            _quantile(f"{key}_95", f"{text}, 95 %", "m", ways, first, 0.95, "drives", goals),
+        ]
+    return tuple(measures)
+
+
+def _after_measures(track: PosePredictions, after: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+    metres, degrees = error_m(after), error_deg(after)
+    later = select(track, localized_before(track))
+    return (
+        _quantile("after_median", "afterwards: error, median", "m", metres, after, 0.5, "fixes", goals),
+        _quantile("after_95", "afterwards: error, 95 %", "m", metres, after, 0.95, "fixes", goals),
+        _quantile("heading_median", "heading error, median", "degrees", degrees, after, 0.5, "fixes", goals),
+        _quantile("heading_95", "heading error, 95 %", "degrees", degrees, after, 0.95, "fixes", goals),
+        _share("available", "scans with a fix, once localized", later.has_fix, later, "scans", goals),
+    )
+
+
+def _wrong_measure(asked: PosePredictions, goals: _Goals) -> Measure:
+    fixes = select(asked, asked.has_fix)
+    return _share("wrong", f"fixes that are wrong by more than {WRONG_M:g} m", error_m(fixes) > WRONG_M, fixes,
+                  "fixes", goals)  # fmt: skip
+
+
+def mahalanobis(fixes: PosePredictions) -> Float64Array:
+    """Return the squared Mahalanobis length (N,) of the horizontal errors; infinite without a covariance."""
+    return squared_mahalanobis(fixes.pose[:, :2] - fixes.truth[:, :2], fixes.covariance[:, :2, :2])
+
+
+def _sigma_measure(after: PosePredictions, goals: _Goals) -> Measure:
+    inside = mahalanobis(after) <= -2.0 * math.log(1.0 - _TWO_SIGMA)
+    return _share("inside_2_sigma", "errors inside 2 sigma (the ellipse of 95.4 %)", inside, after, "fixes", goals)
+
+
+def _away_measures(away: PosePredictions, driven: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+    minutes = sum(np.ptp(driven.stamp_ns[rows]) for rows in _legs(driven)) / 60e9
+    fixes = float(away.has_fix.sum()) if len(away) else math.nan
+    text = f"robot outside the map ({minutes:.0f} minutes of driving, and single scans): fixes given"
+    return (goals.measure("away_fixes", text, "fixes", fixes, fixes, fixes, len(away), "scans"),)
+
+
+def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
+    total = predictions.milliseconds.sum(axis=1)
+    median, high = (float(np.quantile(total, q)) if len(total) else math.nan for q in (0.5, 0.95))
+    return (
+        Measure("scan_ms", "a scan, median", "ms", median, median, median, len(total), "scans"),
+        Measure("scan_ms_95", "a scan, 95 %", "ms", high, high, high, len(total), "scans"),
+    )
+
+
+def _stage(name: str, of: PosePredictions, answer: Float64Array) -> Stage:
+    metres = _distance(of, answer)
+    share = share_of(is_right(of, answer), _clusters(of), _places(of))
+    middle = float(np.median(metres)) if len(metres) else math.nan
+    near, far = (float(np.mean(metres <= radius)) if len(metres) else math.nan for radius in (10.0, 50.0))
+    return Stage(name, len(of), share.value, share.low, share.high, near, far, middle)
+
+
+def _drive_stages(predictions: PosePredictions, on_map: BoolArray) -> tuple[Stage, ...]:
+    """Compare scans of drives that were asked alone with what the track says at the same moment."""
+    number = number_of_alone(predictions)
+    alone = np.flatnonzero((number >= 0) & on_map)
+    at = {
+        (int(j), int(t)): i
+        for i, (j, t) in enumerate(zip(predictions.journey, predictions.stamp_ns, strict=True))
+        if j >= 0
+    }
+    pairs = [(row, at[key]) for row in alone if (key := (int(number[row]), int(predictions.stamp_ns[row]))) in at]
+    if not pairs:
+        return ()
+    lonely = select(predictions, np.array([pair[0] for pair in pairs], np.int64))
+    tracked = select(predictions, np.array([pair[1] for pair in pairs], np.int64))
+    stages = [_stage(name, lonely, answer(lonely)) for name, answer in STAGES.items()]
+    stages.append(_stage("+ fusion, from the first scan on", tracked, tracked.pose[:, [0, 1, 3]]))
+    fixed = select(tracked, tracked.has_fix)
+    stages.append(_stage("+ fusion, where a fix is given", fixed, fixed.pose[:, [0, 1, 3]]))
+    return tuple(stages)
+
+
+def _family_measures(singles: PosePredictions, about: PoseAbout) -> tuple[Measure, ...]:
+    family = np.array(about.families)[singles.area] if len(singles) else np.empty(0, str)
+    held_out = np.isin(family, HELD_OUT_FAMILIES)
+    group = np.array(about.groups)[singles.group] if len(singles) else np.empty(0, str)
+    divisions: list[tuple[str, BoolArray]] = []
+    if held_out.any() and not held_out.all():
+        divisions += [("families seen in training", ~held_out), ("held-out families", held_out)]
+    if len(about.groups) > 1:
+        divisions += [(name, np.asarray(group == name, np.bool_)) for name in about.groups]
+    if len(set(about.families)) > 1:
+        divisions += [(name, np.asarray(family == name, np.bool_)) for name in dict.fromkeys(about.families)]
+    measures = []
+    for name, chosen in divisions:
+        of = select(singles, chosen)
+        if len(of):
+            measures.append(_share(f"end_to_end/{name}", name, is_right(of, best_aligned(of)), of, "scans", _Goals({})))
+    return tuple(measures)
+
+
+def calibration_of(name: str, believed: Float64Array, right: BoolArray) -> Calibration:
+    """Compare probabilities (N,) with what was right (N,), in bins; NaN counts as no belief at all."""
+    believed = np.where(np.isfinite(believed), believed, 0.0)
+    number = np.clip(np.searchsorted(_BINS, believed, side="right") - 1, 0, len(_BINS) - 2)
+    count = np.bincount(number, minlength=len(_BINS) - 1)
+    filled = count > 0
+    mean = np.bincount(number, believed, len(_BINS) - 1)[filled] / count[filled]
+    share = np.bincount(number, right.astype(np.float64), len(_BINS) - 1)[filled] / count[filled]
+    return Calibration(name, mean, share, count[filled].astype(np.int64))
+
+
+def _calibrations(singles: PosePredictions, track: PosePredictions, away: PosePredictions) -> tuple[Calibration, ...]:
+    """Compare belief and truth; off the map nothing is right."""
+    lonely = select(away, away.journey == SINGLE)
+    driven = select(away, away.journey >= 0)
+    nothing = np.zeros(len(lonely), np.bool_)
+    near = _distance(singles, best_aligned(singles)) <= WRONG_M
+    return (
+        calibration_of(
+            "one scan: the best pose, within 10 m",
+            np.concatenate([singles.aligned_probability[:, 0], lonely.aligned_probability[:, 0]]),
+            np.concatenate([near, nothing]),
+        ),
+        calibration_of(
+            "drives: the pose that is followed, within 10 m",
+            np.concatenate([track.probability, driven.probability]),
+            np.concatenate([error_m(track) <= WRONG_M, np.zeros(len(driven), np.bool_)]),
+        ),
+    )
+
+
+def _inside_curves(after: PosePredictions) -> dict[str, Float64Array]:
+    """Return the share of the errors inside of k sigma: of the position by its ellipse, of the heading by its sigma."""
+    if not len(after):
+        return {}
+    position = np.sqrt(mahalanobis(after))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        heading = np.radians(error_deg(after)) / np.sqrt(after.covariance[:, 2, 2])
+    heading = np.where(np.isfinite(heading), heading, np.inf)
+    return {
+        "position": np.array([np.mean(position <= k) for k in SIGMAS]),
+        "heading": np.array([np.mean(heading <= k) for k in SIGMAS]),
+    }
+
+
+def expected_inside(name: str) -> Float64Array:
+    """Return (41,) what share an honest covariance would have inside of k sigma: chi with two degrees, or with one."""
+    if name == "position":
+        return np.asarray(1.0 - np.exp(-0.5 * SIGMAS**2))
+    return np.array([math.erf(k / math.sqrt(2.0)) for k in SIGMAS])
+
+
+def verdicts(measures: Sequence[Measure]) -> dict[str, int]:
+    """Count how many measures reach their goal, their floor alone, and neither."""
+    counts = {"goal": 0, "floor": 0, "below": 0}
+    for measure in measures:
+        if measure.verdict:
+            counts[measure.verdict] += 1
+    return counts

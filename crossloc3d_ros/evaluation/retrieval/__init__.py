@@ -1,0 +1,1 @@
+"""Place recognition: predictions of each query, recall, verification, tables and the page."""

@@ -1,0 +1,305 @@
+"""From predictions to figures: pure functions of what was answered and what is true.
+
+Which queries count: as in the released evaluators, those with at least one database place within the radius; others
+cannot be answered and are left out of that radius, their number is reported.
+
+What an interval means: queries of one town are alike, so towns are the independent pieces of evidence, not queries.
+Each interval is that of a bootstrap that draws whole towns with replacement (2,000 times, fixed seed, percentiles 2.5
+and 97.5). Where fewer than eight towns were asked, squares of 50 m inside of them take their place. A bootstrap of few
+and lucky towns is too narrow, at 0 and 100 % it has no width at all: the interval is widened to hold Wilson's for as
+many trials as there are places at least 25 m apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from crossloc3d_ros.clouds.height_map import HeightMapConfig
+from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
+from crossloc3d_ros.evaluation.recall import Share, hits, independent_places, wilson_share
+from crossloc3d_ros.evaluation.retrieval.predictions import (
+    About,
+    Predictions,
+    database_of,
+    driven_angles,
+    metres_of,
+    one_per_cent,
+)
+from crossloc3d_ros.localization.retrieval.candidates import heading_angles
+from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array
+
+RADII_M = (100.0, 50.0, 25.0)
+RANKS = (1, 5, 10, 25)
+CURVE = 100
+"""Ranks of the AR@N curves."""
+PUBLISHED_ONE_PER_CENT = 25
+"""What the released evaluators call AR@1%: they retrieve 25 results, whatever the size of the database."""
+_RESAMPLED = 2000
+_SEED = 12_345
+_LEAST_CLUSTERS = 8
+_BLOCK_M = 50.0
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How often one of the first `rank` answers lies within `radius_m` of the query."""
+
+    label: str
+    """`R@5`, or `R@1%` where the rank is that share of the database."""
+    rank: int
+    radius_m: float
+    share: Share
+    chance: float
+    """What `rank` different places drawn by lot would reach."""
+    queries: int
+    """Queries counted: those with a place within the radius."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """AR@N over N = 1 to 100 for one radius."""
+
+    radius_m: float
+    recall: Float64Array
+    """(100,)"""
+    chance: Float64Array
+    """(100,)"""
+
+
+@dataclass(frozen=True)
+class GroupScores:
+    """The figures of some of the queries."""
+
+    name: str
+    queries: int
+    areas: int
+    figures: tuple[Figure, ...]
+
+    def figure(self, label: str, radius_m: float) -> Figure:
+        """Return one figure, as `figure("R@1", 100.0)`."""
+        for figure in self.figures:
+            if figure.label == label and figure.radius_m == radius_m:
+                return figure
+        raise KeyError(f"no {label} within {radius_m} m")
+
+
+@dataclass(frozen=True)
+class HeadingErrors:
+    """How well the heading in which a query was found tells the robot's, over first answers within 100 m."""
+
+    queries: int
+    step_deg: float
+    """Between the headings tried."""
+    median_deg: float
+    within_step: float
+    """Share of the errors of at most one step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Everything that predictions are worth."""
+
+    about: About
+    overall: GroupScores
+    groups: tuple[GroupScores, ...]
+    """By the set's own groups, such as held-out families."""
+    families: tuple[GroupScores, ...]
+    areas: tuple[GroupScores, ...]
+    curves: tuple[Curve, ...]
+    first_m: Float64Array
+    """(Q,) metres from each query to its first answer, infinite in another area."""
+    heading: HeadingErrors | None = None
+    """None where a query was tried in one heading alone, or none was found."""
+
+    def tables(self) -> Mapping[str, Sequence[GroupScores]]:
+        """Return the groups of figures by what they are divided by."""
+        return {"all": [self.overall], "group": self.groups, "family": self.families, "area": self.areas}
+
+
+def score(predictions: Predictions, evaluation_set: EvaluationSet) -> Scores:
+    """Score predictions; EvaluationError where they were made of another set."""
+    queries = evaluation_set.queries
+    database = database_of(evaluation_set, predictions.about.setting)
+    metres = metres_of(predictions, evaluation_set)
+    truths = [_Truth.of(metres, queries, database, radius) for radius in RADII_M]
+    everything = np.ones(len(queries), np.bool_)
+
+    def of(name: str, chosen: BoolArray) -> GroupScores:
+        return _group(name, chosen, truths, queries, len(database))
+
+    family_of = np.array(evaluation_set.families)[queries.area]
+    group_of = np.array(evaluation_set.query_groups or [""] * len(queries))
+    families = list(dict.fromkeys(evaluation_set.families))
+    groups = list(dict.fromkeys(evaluation_set.query_groups))
+    areas = sorted(set(queries.area.tolist()))
+    return Scores(
+        about=predictions.about,
+        overall=of("all", everything),
+        groups=tuple(of(name, group_of == name) for name in groups),
+        families=tuple(of(name, family_of == name) for name in families if (family_of == name).any()),
+        areas=tuple(of(evaluation_set.area_names[area], queries.area == area) for area in areas),
+        curves=tuple(_curve(truth, len(database)) for truth in truths),
+        first_m=metres[:, 0],
+        heading=_heading_errors(predictions, queries, np.asarray(metres[:, 0] <= max(RADII_M), dtype=np.bool_)),
+    )
+
+
+def _heading_errors(predictions: Predictions, queries: PlaceSet, found: BoolArray) -> HeadingErrors | None:
+    about = predictions.about
+    if about.heading != "random":
+        return None
+    if predictions.fit_headings_rad is not None:
+        tried, step_deg = predictions.fit_headings_rad[:, 0].astype(np.float64), 360.0 / HeightMapConfig().sectors
+    elif about.way == "nearest" and about.query_headings > 1:
+        tried, step_deg = heading_angles(about.query_headings)[predictions.headings[:, 0]], 360.0 / about.query_headings
+    else:
+        return None
+    driven = found & (driven_angles(queries)[:, 0] == 0.0)  # of the others the heading is not known
+    if not driven.any():
+        return None
+    apart = np.degrees(np.abs(np.angle(np.exp(1j * (tried - queries.heading_rad)[driven]))))
+    return HeadingErrors(int(driven.sum()), step_deg, float(np.median(apart)), float(np.mean(apart <= step_deg)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """Which answers are right within a radius."""
+
+    radius_m: float
+    first_hit: Int64Array
+    """(Q,) place of the first right answer from 0; beyond every rank where there is none."""
+    within: Int64Array
+    """(Q,) places of the database within the radius."""
+
+    @classmethod
+    def of(cls, metres: Float64Array, queries: PlaceSet, database: PlaceSet, radius_m: float) -> _Truth:
+        right = metres <= radius_m
+        first = np.where(right.any(axis=1), right.argmax(axis=1), np.iinfo(np.int64).max)
+        return cls(radius_m, first.astype(np.int64), places_within(queries, database, radius_m))
+
+
+def places_within(queries: PlaceSet, database: PlaceSet, radius_m: float) -> Int64Array:
+    """Count (Q,) the database's places of a query's area within the radius of it."""
+    counts = np.zeros(len(queries), np.int64)
+    for area in np.unique(queries.area):
+        asked, there = queries.area == area, database.area == area
+        if there.any():
+            found = cKDTree(database.xy_m[there]).query_ball_point(queries.xy_m[asked], radius_m, return_length=True)
+            counts[asked] = found
+    return counts
+
+
+def chance_curve(within: Int64Array, database: int, ranks: int) -> Float64Array:
+    """Return (ranks,) the mean chance that N = 1.. different places drawn by lot hold one of those within, (Q,)."""
+    if len(within) == 0:
+        return np.full(ranks, np.nan)
+    counts, times = np.unique(within, return_counts=True)
+    drawn = np.minimum(np.arange(ranks), database)
+    left = np.maximum(database - drawn, 1)[None, :]
+    miss = np.cumprod(np.clip(database - counts[:, None] - drawn[None, :], 0, None) / left, axis=1)
+    return np.asarray(1.0 - (times[:, None] * miss).sum(axis=0) / times.sum())
+
+
+def clusters_of(queries: PlaceSet) -> Int64Array:
+    """Return (Q,) which independent piece of evidence each query belongs to: its area, or a square of 50 m in it."""
+    return clusters_among(queries.area, queries.xy_m)
+
+
+def clusters_among(area: Int64Array, xy_m: Float64Array) -> Int64Array:
+    """Return the same (Q,) of areas (Q,) and positions (Q, 2)."""
+    areas = np.unique(area)
+    if len(areas) >= _LEAST_CLUSTERS:
+        return np.searchsorted(areas, area).astype(np.int64)
+    squares = np.column_stack([area, np.floor(xy_m / _BLOCK_M).astype(np.int64)])
+    return np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def share_of(hit: BoolArray, clusters: Int64Array, places: int) -> Share:
+    """Return the share of hits (Q,) with its 95 % interval, as the module's docstring explains it.
+
+    `clusters` (Q,): the independent piece of evidence that each query belongs to; `places`: how many places at least
+    25 m apart the queries are.
+    """
+    if len(hit) == 0:
+        return Share(float("nan"), 0.0, 1.0)
+    low, high = _bootstrap(hit.astype(np.float64), clusters)
+    value = float(hit.mean())
+    wilson = wilson_share(value, places)
+    return Share(value, min(low, wilson.low), max(high, wilson.high))
+
+
+def difference(
+    one: Predictions, other: Predictions, evaluation_set: EvaluationSet, rank: int = 1, radius_m: float = 100.0
+) -> Share:
+    """Return by how much the recall of `one` exceeds that of `other` on the same queries, with its 95 % interval.
+
+    The bootstrap draws whole areas, the same for both, so that what is hard about a town cancels. An interval without 0
+    says that one method is ahead. Both must be of the same set and setting.
+    """
+    if one.about.setting != other.about.setting:
+        raise ValueError(f"settings differ: {one.about.setting} and {other.about.setting}")
+    queries, database = evaluation_set.queries, database_of(evaluation_set, one.about.setting)
+    counted = np.asarray(places_within(queries, database, radius_m) > 0, dtype=np.bool_)
+    hit, other_hit = (hits(metres_of(each, evaluation_set)[counted], rank, radius_m) for each in (one, other))
+    ahead = hit.astype(np.float64) - other_hit
+    if len(ahead) == 0:
+        return Share(float("nan"), -1.0, 1.0)
+    low, high = _bootstrap(ahead, clusters_of(_chosen(queries, counted)))
+    return Share(float(ahead.mean()), low, high)
+
+
+def _bootstrap(values: Float64Array, clusters: Int64Array) -> tuple[float, float]:
+    """Return the percentiles 2.5 and 97.5 of the mean of values (Q,) when whole clusters (Q,) are drawn by lot."""
+    numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
+    sums, counts = np.bincount(numbers, values), np.bincount(numbers)
+    drawn = bootstrap_draws(len(sums))
+    low, high = np.percentile((drawn @ sums) / (drawn @ counts), [2.5, 97.5])
+    return float(low), float(high)
+
+
+@functools.lru_cache(maxsize=16)
+def bootstrap_draws(count: int) -> Float64Array:
+    """Return (resamplings, count) how often each of `count` clusters is drawn; always the same."""
+    drawn = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1.0 / count), _RESAMPLED)
+    return np.asarray(drawn, dtype=np.float64)
+
+
+def _group(name: str, chosen: BoolArray, truths: Sequence[_Truth], queries: PlaceSet, database: int) -> GroupScores:
+    ranks = [*((f"R@{rank}", rank) for rank in RANKS), ("R@1%", one_per_cent(database))]
+    figures = []
+    for truth in truths:
+        counted = chosen & (truth.within > 0)
+        asked = _chosen(queries, counted)
+        clusters, places = clusters_of(asked), _independent(asked)
+        chance = chance_curve(truth.within[counted], database, max(rank for _, rank in ranks))
+        for label, rank in ranks:
+            share = share_of(truth.first_hit[counted] < rank, clusters, places)
+            figures.append(Figure(label, rank, truth.radius_m, share, float(chance[rank - 1]), int(counted.sum())))
+    return GroupScores(name, int(chosen.sum()), len(np.unique(queries.area[chosen])), tuple(figures))
+
+
+def _curve(truth: _Truth, database: int) -> Curve:
+    counted = truth.within > 0
+    first = truth.first_hit[counted]
+    reached = np.array([(first < rank).mean() if len(first) else np.nan for rank in range(1, CURVE + 1)])
+    return Curve(truth.radius_m, reached, chance_curve(truth.within[counted], database, CURVE))
+
+
+def _chosen(queries: PlaceSet, chosen: BoolArray) -> PlaceSet:
+    """Return the places alone, without patches, of some queries."""
+    count = int(chosen.sum())
+    empty = np.zeros((count, 1, 3), np.float32)
+    return dataclasses.replace(
+        queries, patches=empty, area=queries.area[chosen], xy_m=queries.xy_m[chosen],
+        heading_rad=queries.heading_rad[chosen],
+    )  # fmt: skip
+
+
+def _independent(queries: PlaceSet) -> int:
+    return sum(independent_places(queries.xy_m[queries.area == area]) for area in np.unique(queries.area))

@@ -1,0 +1,1 @@
+"""From candidate submaps to poses with likelihoods and covariances."""

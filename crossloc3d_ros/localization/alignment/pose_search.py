@@ -1,0 +1,355 @@
+"""Where in the map, and in which heading, the evidence of a scan fits: exhaustive on coarse cells, then finer.
+
+The score of a pose is the sum of the log likelihood ratios of all the evidence laid into the map at that pose. On a
+coarse level it is taken for every cell of the area and every heading, row by row, so that one addition serves many
+poses at once; what scores best is looked at again on the next level, and at last at will in fine cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from crossloc3d_ros.localization.alignment.evidence import CELL_M, LAYERS, Evidence
+from crossloc3d_ros.localization.alignment.likelihood import QUANTA, Int16Array, Level, MapLikelihood, UInt16Array
+from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
+
+_STEPS = ((1.0, math.radians(2.0)), (0.5, math.radians(1.0)), (0.25, math.radians(0.5)), (0.12, math.radians(0.25)))
+_MOVES = 6  # at most so many moves on each step of the climb
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Poses at which the evidence fits."""
+
+    poses: Float64Array
+    """(p, 3) metres east and north of the likelihood's south-west corner, heading in radians from east."""
+    scores: Float64Array
+    """(p,) nats."""
+
+
+def search_cells(
+    evidence: Evidence, level: Level, runs: Int64Array, headings: int, most: int, apart_m: float, threads: int = 1
+) -> Peaks:
+    """Return the best poses with the base in one of the cells of a level that `runs` names, best first.
+
+    They are at least `apart_m` apart. `runs` (R, 3): row, first column and length of stretches of cells, as `around`
+    and `inside` give them; so far from the edge of the level that the evidence stays inside. `evidence` is in cells of
+    the level, its passages in blocks of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
+    """
+    if not len(runs) or not len(evidence):
+        return Peaks(np.empty((0, 3)), np.empty(0))
+    angles = 2.0 * math.pi * np.arange(headings) / headings
+    xy, channel = np.ascontiguousarray(evidence.xy_m), evidence.channel
+
+    def part(which: Int64Array) -> tuple[Int16Array, Int16Array]:
+        best, heading = _correlate(level.ratios, xy, channel, level.cell_m, angles[which], runs, LAYERS)
+        return best, which[heading].astype(np.int16)
+
+    # In order, so that the first of several best headings is taken, by however many threads.
+    parts = np.array_split(np.arange(headings), min(threads, headings))
+    if len(parts) == 1:
+        results = [part(parts[0])]
+    else:
+        with ThreadPoolExecutor(len(parts)) as pool:
+            results = list(pool.map(part, parts))
+    best, heading = results[0]
+    for other, its_heading in results[1:]:
+        better = other > best
+        best, heading = np.where(better, other, best), np.where(better, its_heading, heading)
+    rows = np.repeat(runs[:, 0], runs[:, 2])
+    columns = np.concatenate([np.arange(start, start + count) for start, count in runs[:, 1:]])
+    ways = np.column_stack([columns + 0.5, rows + 0.5]) * level.cell_m
+    chosen = _apart(ways, best.astype(np.float64), most, apart_m)
+    poses = np.column_stack([ways[chosen], angles[heading[chosen]]])
+    return Peaks(poses, best[chosen] / QUANTA)
+
+
+def climb(
+    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, *, reach_m: float, threads: int = 1
+) -> tuple[Peaks, BoolArray]:
+    """Climb from each pose (p, 3) to the best one around it in the fine cells, in smaller and smaller steps.
+
+    Returns the poses in their order and whether each came to rest within `reach_m` of where it began.
+    """
+    xy, steps = np.ascontiguousarray(evidence.xy_m), np.array(_STEPS)
+
+    def part(some: Float64Array) -> tuple[Float64Array, Float64Array, BoolArray]:
+        found: tuple[Float64Array, Float64Array, BoolArray] = _climb(
+            likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, reach_m, steps, _MOVES, CELL_M
+        )
+        return found
+
+    found, scores, rested = _in_parts(part, poses, threads)
+    return Peaks(found, scores), rested
+
+
+def scores_at(evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, threads: int = 1) -> Float64Array:
+    """Return the scores (p,) of poses (p, 3) in the fine cells, nats."""
+    xy = np.ascontiguousarray(evidence.xy_m)
+
+    def part(some: Float64Array) -> tuple[Float64Array]:
+        return (_scores(likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, CELL_M),)
+
+    return np.asarray(_in_parts(part, poses, threads)[0])
+
+
+def local_search(
+    evidence: Evidence, level: Level, poses: Float64Array, reach_m: float, turn_rad: float, turns: int, threads: int = 1
+) -> Peaks:
+    """Return the best pose within `reach_m` and `turn_rad` of each pose (p, 3), on the grid of a level, in their order.
+
+    `turns` steps of the heading to either side.
+    """
+    xy, reach = np.ascontiguousarray(evidence.xy_m), round(reach_m / level.cell_m)
+
+    def part(some: Float64Array) -> tuple[Float64Array, Float64Array]:
+        found: tuple[Float64Array, Float64Array] = _local(
+            level.ratios, xy, evidence.channel, level.cell_m, some, reach, turn_rad / max(turns, 1), turns, LAYERS
+        )
+        return found
+
+    found, scores = _in_parts(part, poses, threads)
+    return Peaks(found, scores / QUANTA)
+
+
+def merge(peaks: Peaks, apart_m: float, apart_rad: float) -> Int64Array:
+    """Return which peaks to keep, best first: one of those nearer than both to a better one."""
+    near = are_near(peaks.poses, apart_m, apart_rad)
+    kept: list[int] = []
+    for i in np.argsort(-peaks.scores, kind="stable"):
+        if not near[i, kept].any():
+            kept.append(int(i))
+    return np.array(kept, np.int64)
+
+
+def are_near(poses: Float64Array, apart_m: float, apart_rad: float) -> BoolArray:
+    """Mark the pairs (n, n) of poses (n, 3) that are nearer to each other than both bounds."""
+    off = poses[:, None] - poses[None]
+    turned = np.abs((off[..., 2] + math.pi) % (2.0 * math.pi) - math.pi)
+    return np.asarray((np.hypot(off[..., 0], off[..., 1]) < apart_m) & (turned < apart_rad))
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius_m: float) -> Int64Array:
+    """Return the runs (R, 3) of a level's cells on the map within `radius_m` of any place (k, 2), local metres."""
+    whole = inside(likelihood, level)
+    places = places[np.isfinite(places).all(axis=1)]
+    if not len(whole) or not len(places):
+        return np.empty((0, 3), np.int64)
+    # Far outside nothing is near; clipped, it fits into whole numbers.
+    side = level.cell_m * max(level.ratios.shape[1:])
+    x, y = np.clip(places, -side - radius_m, 2.0 * side + radius_m).T / level.cell_m - 0.5
+    reach = radius_m / level.cell_m
+    rows = np.floor(y)[:, None] + np.arange(-math.ceil(reach), math.ceil(reach) + 2)
+    half2 = reach**2 - (rows - y[:, None]) ** 2
+    half = np.sqrt(np.maximum(half2, 0.0))
+    first = np.maximum(np.ceil(x[:, None] - half), whole[0, 1])
+    last = np.minimum(np.floor(x[:, None] + half), whole[0, 1] + whole[0, 2] - 1)
+    some = (half2 >= 0.0) & (last >= first) & (rows >= whole[0, 0]) & (rows <= whole[-1, 0])
+    # In one long line, row after row, the stretches are joined where they touch or lap over.
+    columns = level.ratios.shape[2]
+    starts, ends = (rows[some] * columns + first[some]).astype(np.int64), (rows[some] * columns + last[some] + 1)
+    order = np.argsort(starts, kind="stable")
+    starts, ends = starts[order], np.maximum.accumulate(ends[order].astype(np.int64))
+    new = np.ones(len(starts), np.bool_)
+    new[1:] = (starts[1:] > ends[:-1]) | (starts[1:] // columns != starts[:-1] // columns)
+    starts, ends = starts[new], ends[np.append(np.flatnonzero(new)[1:] - 1, len(ends) - 1)] if len(ends) else ends
+    return np.column_stack([starts // columns, starts % columns, ends - starts])
+
+
+def inside(likelihood: MapLikelihood, level: Level) -> Int64Array:
+    """Return the runs (R, 3) of a level's cells whose middles lie on the map: one for each row."""
+    west, south, east, north = likelihood.aerial_map.bounds
+    rows, columns = level.ratios.shape[1:]
+    x = likelihood.west_m + (np.arange(columns) + 0.5) * level.cell_m
+    y = likelihood.south_m + (np.arange(rows) + 0.5) * level.cell_m
+    across, along = np.flatnonzero((x > west) & (x < east)), np.flatnonzero((y > south) & (y < north))
+    if not len(across):
+        return np.empty((0, 3), np.int64)
+    return np.column_stack([along, np.full(len(along), across[0]), np.full(len(along), len(across))])
+
+
+def _in_parts(work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, threads: int) -> tuple[Any, ...]:
+    """Return what `work` gives for poses (p, 3), done by some threads: arrays of p rows."""
+    poses = np.ascontiguousarray(poses, np.float64)
+    parts = np.array_split(poses, max(min(threads, len(poses)), 1))
+    if len(parts) == 1:
+        return work(poses)
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return tuple(np.concatenate(results) for results in zip(*pool.map(work, parts), strict=True))
+
+
+def _apart(ways: Float64Array, scores: Float64Array, most: int, apart_m: float) -> Int64Array:
+    """Return the best of the ways (n, 2), greedily, each `apart_m` from those before."""
+    candidates = min(len(scores), 400 * most)
+    order = np.argpartition(-scores, candidates - 1)[:candidates]
+    order = order[np.argsort(-scores[order], kind="stable")]
+    chosen: Int64Array = _greedy(np.ascontiguousarray(ways[order]), most, apart_m)
+    return order[chosen]
+
+
+@njit(cache=True, nogil=True)
+def _greedy(ways: Float64Array, most: int, apart_m: float) -> Int64Array:
+    chosen = np.empty(most, np.int64)
+    count = 0
+    for i in range(len(ways)):
+        free = True
+        for j in range(count):
+            dx, dy = ways[i, 0] - ways[chosen[j], 0], ways[i, 1] - ways[chosen[j], 1]
+            if dx * dx + dy * dy < apart_m * apart_m:
+                free = False
+                break
+        if free:
+            chosen[count] = i
+            count += 1
+            if count == most:
+                break
+    return chosen[:count]
+
+
+@njit(cache=True, nogil=True)
+def _correlate(  # type: ignore[no-untyped-def]
+    ratios: Int16Array, xy: Float64Array, channel: Int64Array, cell: float, angles: Float64Array, runs: Int64Array,
+    layers: int,
+):  # fmt: skip
+    """Return the best score and its heading's number for every cell of the runs, one after the other."""
+    _, rows, columns = ratios.shape
+    flat = ratios.reshape(-1)
+    total = 0
+    widest = 0
+    for k in range(len(runs)):
+        total += runs[k, 2]
+        widest = max(widest, runs[k, 2])
+    best = np.full(total, -32768, np.int16)
+    heading = np.zeros(total, np.int16)
+    sums = np.zeros(widest, np.int16)
+    offsets = np.empty(len(channel), np.int64)
+    for h in range(len(angles)):
+        c, s = math.cos(angles[h]), math.sin(angles[h])
+        for e in range(len(channel)):
+            u, v = (c * xy[e, 0] - s * xy[e, 1]) / cell, (s * xy[e, 0] + c * xy[e, 1]) / cell
+            # From the middle of the base's cell; a block of passages is named by its lower left cell.
+            middle = 0.5 if channel[e] < layers else 0.0
+            column, row = math.floor(u + middle), math.floor(v + middle)
+            offsets[e] = (channel[e] * rows + row) * columns + column
+        at = 0
+        for k in range(len(runs)):
+            width = runs[k, 2]
+            first = runs[k, 0] * columns + runs[k, 1]
+            for j in range(width):
+                sums[j] = 0
+            for e in range(len(offsets)):
+                start = first + offsets[e]
+                line = flat[start : start + width]
+                for j in range(width):
+                    sums[j] += line[j]
+            for j in range(width):
+                if sums[j] > best[at + j]:
+                    best[at + j] = sums[j]
+                    heading[at + j] = h
+            at += width
+    return best, heading
+
+
+@njit(cache=True, nogil=True)
+def _local(  # type: ignore[no-untyped-def]
+    ratios: Int16Array, xy: Float64Array, channel: Int64Array, cell: float, poses: Float64Array, reach: int,
+    turn: float, turns: int, layers: int,
+):  # fmt: skip
+    _, rows, columns = ratios.shape
+    found = poses.copy()
+    scores = np.zeros(len(poses))
+    side = 2 * reach + 1
+    sums = np.empty((side, side), np.int32)
+    for p in range(len(poses)):
+        best = -(1 << 30)
+        for t in range(-turns, turns + 1):
+            angle = poses[p, 2] + t * turn
+            c, s = math.cos(angle), math.sin(angle)
+            sums[:] = 0
+            for e in range(len(channel)):
+                x, y = poses[p, 0] + c * xy[e, 0] - s * xy[e, 1], poses[p, 1] + s * xy[e, 0] + c * xy[e, 1]
+                middle = 0.0 if channel[e] < layers else 0.5
+                column, row = math.floor(x / cell - middle) - reach, math.floor(y / cell - middle) - reach
+                if row < 0 or column < 0 or row + side > rows or column + side > columns:
+                    continue
+                for i in range(side):
+                    for j in range(side):
+                        sums[i, j] += ratios[channel[e], row + i, column + j]
+            for i in range(side):
+                for j in range(side):
+                    if sums[i, j] > best:
+                        best = sums[i, j]
+                        found[p, 0], found[p, 1] = poses[p, 0] + (j - reach) * cell, poses[p, 1] + (i - reach) * cell
+                        found[p, 2] = angle
+        scores[p] = best
+    return found, scores
+
+
+@njit(cache=True, nogil=True)
+def _score(
+    classes: UInt16Array, log_ratios: Float32Array, xy: Float64Array, channel: Int64Array, x: float, y: float,
+    angle: float, cell: float,
+) -> float:  # fmt: skip
+    rows, columns = classes.shape
+    c, s = math.cos(angle) / cell, math.sin(angle) / cell
+    u0, v0 = x / cell, y / cell
+    total = 0.0
+    for e in range(len(channel)):
+        column = int(u0 + c * xy[e, 0] - s * xy[e, 1])
+        row = int(v0 + s * xy[e, 0] + c * xy[e, 1])
+        if 0 <= row < rows and 0 <= column < columns:
+            total += log_ratios[channel[e], classes[row, column]]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _scores(
+    classes: UInt16Array, log_ratios: Float32Array, xy: Float64Array, channel: Int64Array, poses: Float64Array,
+    cell: float,
+) -> Float64Array:  # fmt: skip
+    scores = np.empty(len(poses))
+    for p in range(len(poses)):
+        scores[p] = _score(classes, log_ratios, xy, channel, poses[p, 0], poses[p, 1], poses[p, 2], cell)
+    return scores
+
+
+@njit(cache=True, nogil=True)
+def _climb(  # type: ignore[no-untyped-def]
+    classes: UInt16Array, log_ratios: Float32Array, xy: Float64Array, channel: Int64Array, poses: Float64Array,
+    reach: float, steps: Float64Array, moves: int, cell: float,
+):  # fmt: skip
+    found = poses.copy()
+    scores = np.empty(len(poses))
+    rested = np.ones(len(poses), np.bool_)
+    for p in range(len(poses)):
+        x, y, angle = poses[p, 0], poses[p, 1], poses[p, 2]
+        best = _score(classes, log_ratios, xy, channel, x, y, angle, cell)
+        for k in range(len(steps)):
+            for _ in range(moves):
+                bx, by, ba = x, y, angle
+                for dx in range(-1, 2):
+                    for dy in range(-1, 2):
+                        for da in range(-1, 2):
+                            nx, ny, na = x + dx * steps[k, 0], y + dy * steps[k, 0], angle + da * steps[k, 1]
+                            score = _score(classes, log_ratios, xy, channel, nx, ny, na, cell)
+                            if score > best:
+                                best, bx, by, ba = score, nx, ny, na
+                if bx == x and by == y and ba == angle:
+                    break
+                x, y, angle = bx, by, ba
+        found[p, 0], found[p, 1], found[p, 2] = x, y, angle
+        scores[p] = best
+        rested[p] = math.hypot(x - poses[p, 0], y - poses[p, 1]) <= reach
+    return found, scores, rested

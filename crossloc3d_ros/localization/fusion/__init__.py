@@ -1,0 +1,1 @@
+"""From poses and odometry over time to one belief."""

@@ -1,0 +1,1 @@
+"""From a patch to candidate submaps, and the place that they speak for."""

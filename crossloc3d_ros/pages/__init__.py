@@ -1,0 +1,1 @@
+"""Figures as text, charts as SVG, templates as self-contained HTML."""
