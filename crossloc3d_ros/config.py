@@ -6,16 +6,66 @@ A field carries its one default, and in its metadata the sentence that describes
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import os
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 from crossloc3d_ros.errors import ConfigError
 
 T = TypeVar("T")
+
+RENAMED = {
+    "most_waiting": "queue_depth",
+    "publish_tf": "tf_broadcast",
+    "tf_tolerance_s": "transform_tolerance",
+    "odometry_wait_s": "odometry_timeout_s",
+    "scan.turn_s": "scan.period_s",
+    "credibility": "retrieval",
+    "credibility.temperature": "retrieval.temperature",
+    "credibility.none_distance": "retrieval.null_distance",
+    "credibility.none_scale": "retrieval.null_scale",
+    "credibility.cluster_radius_m": "retrieval.cluster_radius_m",
+    "credibility.min_probability": "retrieval.min_probability",
+    "credibility.position_floor_m": "retrieval.min_std_m",
+    "credibility.height_floor_m": "retrieval.min_height_std_m",
+    "alignment.search": "alignment.scope",
+    "alignment.exhaustive_km2": "alignment.map_max_km2",
+    "alignment.exhaustive_every_s": "alignment.map_period_s",
+    "alignment.convincing": "alignment.sufficient_probability",
+    "alignment.search_every_s": "alignment.candidates_period_s",
+    "alignment.look_every_s": "alignment.candidates_period_localized_s",
+    "alignment.radius_m": "alignment.candidate_radius_m",
+    "alignment.follow_m": "alignment.hypothesis_radius_m",
+    "alignment.peaks": "alignment.coarse_maxima",
+    "alignment.poses": "alignment.fine_maxima",
+    "alignment.shape_temperature": "alignment.covariance_temperature",
+    "fusion.evidence_m": "fusion.novelty_m",
+    "fusion.evidence_weight": "fusion.likelihood_weight",
+    "fusion.evidence_limit": "fusion.max_log_likelihood",
+    "fusion.blind_share": "fusion.clutter_probability",
+    "fusion.found_share": "fusion.detection_probability",
+    "fusion.carried_per_s": "fusion.kidnapping_per_s",
+    "fusion.prior_belief": "fusion.initial_pose_probability",
+    "fusion.error_scale": "fusion.measurement_std_scale",
+    "fusion.error_share": "fusion.measurement_error_correlation",
+    "fusion.error_m": "fusion.measurement_correlation_m",
+    "fusion.position_floor_m": "fusion.measurement_min_std_m",
+    "fusion.heading_floor_deg": "fusion.measurement_min_std_deg",
+    "fusion.map_error_m": "fusion.map_std_m",
+    "fusion.map_turn_deg": "fusion.map_std_deg",
+    "fusion.odometry_error": "fusion.odometry_relative_std",
+    "fusion.odometry_turn_deg_per_m": "fusion.odometry_drift_deg_per_m",
+    "fusion.odometry_gap_s": "fusion.odometry_max_gap_s",
+    "fusion.slip_m": "fusion.slip_std_m",
+    "fusion.slip_share": "fusion.slip_probability",
+    "fusion.forget_s": "fusion.unknown_motion_decay_s",
+    "turns": "rotations",
+}
+"""Settings of version 0.1 under other names: an old name is refused with the new one."""
 
 _MOST_THREADS = 4  # more gain nothing for a single scan
 
@@ -92,7 +142,7 @@ class ScanConfig:
     body_max_m: tuple[float, float, float] = option(
         (0.6, 0.5, 2.0), "upper corner; equal = no body", low=-50.0, high=50.0
     )
-    turn_s: float = option(0.1, "time of one turn of the lidar", low=0.0, high=10.0)
+    period_s: float = option(0.1, "time of one turn of the lidar", low=0.0, high=10.0)
     stamped_at: float = option(1.0, "what the stamp tells: 0 = the turn's start, 1 = its end", low=0.0, high=1.0)
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
 
@@ -109,52 +159,52 @@ class CalibrationConfig:
     """What distances between descriptors mean; fitted on known places and stored with the weights."""
 
     temperature: float = option(0.1, "distance by which a candidate's odds fall to 1/e", low=1e-6, high=1e6)
-    none_distance: float = option(1.0, "best distance at which 'no such place' is as likely as not", low=1e-6, high=1e6)
-    none_scale: float = option(0.1, "distance over which that belief turns", low=1e-6, high=1e6)
+    null_distance: float = option(1.0, "best distance at which 'no such place' is as likely as not", low=1e-6, high=1e6)
+    null_scale: float = option(0.1, "distance over which that belief turns", low=1e-6, high=1e6)
 
 
 @dataclass(frozen=True)
-class CredibilityConfig:
+class RetrievalConfig:
     """From the candidates' distances and spread to probabilities, a covariance and the decision to give a fix."""
 
     temperature: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
-    none_distance: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
-    none_scale: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
+    null_distance: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
+    null_scale: float = option(0.0, "overrides the weights' own calibration; 0 = keep it", low=0.0, high=1e6)
     cluster_radius_m: float = option(50.0, "candidates this near to each other mean one place", low=1.0, high=1000.0)
     min_probability: float = option(0.7, "a fix needs this belief in one place", low=0.0, high=1.0)
-    position_floor_m: float = option(25.0, "least standard deviation east and north", low=0.1, high=1000.0)
-    height_floor_m: float = option(3.0, "least standard deviation of the height", low=0.1, high=1000.0)
+    min_std_m: float = option(25.0, "least standard deviation east and north", low=0.1, high=1000.0)
+    min_height_std_m: float = option(3.0, "least standard deviation of the height", low=0.1, high=1000.0)
 
 
 @dataclass(frozen=True)
 class AlignmentConfig:
     """From places to poses."""
 
-    search: Literal["retrieval", "exhaustive", "auto", "off"] = option(
+    scope: Literal["candidates", "map", "auto", "none"] = option(
         "auto",
-        "poses are sought around candidates, everywhere, or both where the map is small; or not at all",
+        "where poses are searched: around the candidates, on the whole map, both where the map is small; or not at all",
     )
-    exhaustive_km2: float = option(6.0, "largest map that auto searches as a whole", low=0.0, high=1e6)
-    exhaustive_every_s: float = option(3.0, "the whole map is searched no more often", low=0.0, high=1e6)
-    convincing: float = option(
-        0.9, "auto does not where a pose is believed so, at a candidate or followed", low=0.0, high=1.0
+    map_max_km2: float = option(6.0, "largest map that auto searches as a whole", low=0.0, high=1e6)
+    map_period_s: float = option(3.0, "the whole map is searched no more often", low=0.0, high=1e6)
+    sufficient_probability: float = option(
+        0.9, "auto leaves the rest of the map alone where one pose has this probability", low=0.0, high=1.0
     )
-    search_every_s: float = option(0.45, "the candidates no more often while not localized", low=0.0, high=1e6)
-    look_every_s: float = option(1.0, "and no more often while localized", low=0.0, high=1e6)
+    candidates_period_s: float = option(0.45, "the candidates no more often while not localized", low=0.0, high=1e6)
+    candidates_period_localized_s: float = option(1.0, "and no more often while localized", low=0.0, high=1e6)
     candidates: int = option(100, "so many candidates are aligned", low=1, high=10_000)
-    radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
-    follow_m: float = option(6.0, "how far from its prediction a hypothesis may be aligned", low=0.5, high=50.0)
-    peaks: int = option(
+    candidate_radius_m: float = option(22.0, "how far around a candidate", low=1.0, high=200.0)
+    hypothesis_radius_m: float = option(6.0, "how far from its prediction a hypothesis is aligned", low=0.5, high=50.0)
+    coarse_maxima: int = option(
         64,
         "poses around the candidates that are looked at more closely; on the whole map four times as many",
         low=1,
         high=1000,
     )
-    poses: int = option(16, "of these, how many in the finest cells; on the whole map twice", low=1, high=1000)
+    fine_maxima: int = option(16, "of these, how many in the finest cells; on the whole map twice", low=1, high=1000)
     descriptor_weight: float = option(0.5, "of the candidates' belief beside the alignment's", low=0.0, high=10.0)
     min_cells: int = option(100, "a scan that saw fewer cells says nothing", low=1, high=100_000)
     place_m2: float = option(100.0, "area of the map that counts as one place before a scan", low=0.01, high=1e6)
-    shape_temperature: float = option(20.0, "score that makes a pose e times likelier than its neighbour", low=0.01)
+    covariance_temperature: float = option(20.0, "score difference of a factor e in probability", low=0.01)
 
 
 @dataclass(frozen=True)
@@ -164,32 +214,34 @@ class FusionConfig:
     min_probability: float = option(0.999, "a fix needs this belief in an error below 10 m", low=0.5, high=1.0)
     confirm_m: float = option(10.0, "and a pose that has explained the scans for so long a way", low=0.0, high=1000.0)
     max_hypotheses: int = option(10, "poses carried along at most", low=1, high=1000)
-    evidence_m: float = option(10.0, "way over which what a scan tells becomes news", low=0.1, high=1000.0)
-    evidence_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
-    evidence_limit: float = option(15.0, "no scan tells more than this logarithm for the map", low=1.0, high=1000.0)
-    blind_share: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
-    found_share: float = option(
+    novelty_m: float = option(10.0, "way over which a scan becomes independent of those before", low=0.1, high=1000.0)
+    likelihood_weight: float = option(1.0, "factor on the scans' log likelihoods", low=0.01, high=10.0)
+    max_log_likelihood: float = option(15.0, "no scan tells more than this logarithm for the map", low=1.0, high=1000.0)
+    clutter_probability: float = option(0.05, "share of the scans that tell nothing of the place", low=1e-6, high=0.9)
+    detection_probability: float = option(
         0.9, "share of the scans on the map whose true pose is among the aligned ones", low=0.01, high=0.999
     )
-    carried_per_s: float = option(1e-4, "how often the robot is carried away unnoticed", low=1e-9, high=1.0)
-    prior_belief: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)
-    error_scale: float = option(1.5, "factor on the standard deviations of aligned poses", low=0.1, high=100.0)
-    error_share: float = option(
+    kidnapping_per_s: float = option(1e-4, "rate at which the robot is kidnapped unnoticed", low=1e-9, high=1.0)
+    initial_pose_probability: float = option(0.9, "belief in a pose that is given from outside", low=0.01, high=0.999)
+    measurement_std_scale: float = option(1.5, "factor on aligned poses' standard deviations", low=0.1, high=100.0)
+    measurement_error_correlation: float = option(
         0.3, "share of an aligned pose's variance that the next scan's error has in common", low=0.0, high=0.99
     )
-    error_m: float = option(15.0, "way over which that common error changes", low=0.1, high=1000.0)
-    position_floor_m: float = option(0.2, "least standard deviation of an aligned pose", low=0.01, high=10.0)
-    heading_floor_deg: float = option(0.4, "the same of its heading", low=0.01, high=10.0)
-    map_error_m: float = option(0.23, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
-    map_turn_deg: float = option(0.2, "the same of every heading", low=0.0, high=10.0)
-    odometry_error: float = option(0.05, "of odometry, one sigma, share of the way and of the turn", low=1e-4, high=1.0)
-    odometry_turn_deg_per_m: float = option(0.3, "what it turns too much or too little a metre", low=0.0, high=45.0)
-    odometry_gap_s: float = option(0.5, "over a longer gap between its samples it is unknown", low=0.01, high=60.0)
-    slip_m: float = option(1.0, "size of an error of odometry beyond all bounds, one sigma", low=0.01, high=100.0)
-    slip_share: float = option(1e-3, "share of the scans before which there is one", low=0.0, high=0.5)
+    measurement_correlation_m: float = option(15.0, "way over which that common error changes", low=0.1, high=1000.0)
+    measurement_min_std_m: float = option(0.2, "least standard deviation of an aligned pose", low=0.01, high=10.0)
+    measurement_min_std_deg: float = option(0.4, "the same of its heading", low=0.01, high=10.0)
+    map_std_m: float = option(0.23, "error that never changes, one sigma, of every position", low=0.0, high=10.0)
+    map_std_deg: float = option(0.2, "the same of every heading", low=0.0, high=10.0)
+    odometry_relative_std: float = option(0.05, "one sigma, as a share of the way and of the turn", low=1e-4, high=1.0)
+    odometry_drift_deg_per_m: float = option(0.3, "what it turns too much or too little a metre", low=0.0, high=45.0)
+    odometry_max_gap_s: float = option(0.5, "over a longer gap between its samples it is unknown", low=0.01, high=60.0)
+    slip_std_m: float = option(1.0, "size of an error of odometry beyond all bounds, one sigma", low=0.01, high=100.0)
+    slip_probability: float = option(1e-3, "share of the scans before which there is one", low=0.0, high=0.5)
     max_speed_mps: float = option(10.0, "the robot drives no faster", low=0.1, high=200.0)
     max_turn_deg_per_s: float = option(120.0, "and turns no faster", low=1.0, high=10_000.0)
-    forget_s: float = option(10.0, "time of unknown motion that leaves a belief of 1/e", low=0.1, high=1e5)
+    unknown_motion_decay_s: float = option(
+        10.0, "unknown motion for so long leaves 1/e of the belief", low=0.1, high=1e5
+    )
     restart_s: float = option(3.0, "a stamp farther back begins a new recording: all is forgotten", low=0.0, high=1e5)
 
 
@@ -199,7 +251,9 @@ class LocalizerConfig:
 
     top_k: int = option(25, "candidates to retrieve", low=1, high=1000)
     scan: ScanConfig = field(default_factory=ScanConfig, metadata={"text": "use of the scan"})
-    credibility: CredibilityConfig = field(default_factory=CredibilityConfig, metadata={"text": "what is believed"})
+    retrieval: RetrievalConfig = field(
+        default_factory=RetrievalConfig, metadata={"text": "what the distances of candidates mean"}
+    )
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig, metadata={"text": "from places to poses"})
     fusion: FusionConfig = field(default_factory=FusionConfig, metadata={"text": "poses over time"})
 
@@ -212,7 +266,7 @@ class LocalizerNodeConfig(LocalizerConfig):
     weights: str = option("", "weights file (safetensors); empty = the shipped weights")
     device: Literal["cpu", "cuda"] = option("cpu", "where the encoder runs")
     threads: int = option(0, "CPU threads for a descriptor; 0 = as many as cores, at most four", low=0, high=64)
-    most_waiting: int = option(
+    queue_depth: int = option(
         4,
         "scans that may wait while one is worked on; where more come, all but the newest are dropped",
         low=1,
@@ -232,9 +286,9 @@ class LocalizerNodeConfig(LocalizerConfig):
     odometry: Literal["topic", "scan", "none"] = option(
         "topic", "how the robot has moved: told on topic odom, from scan to scan (the extra 'odometry'), or unknown"
     )
-    odometry_wait_s: float = option(0.02, "how long a scan waits for the odometry of its stamp", low=0.0, high=1.0)
-    publish_tf: bool = option(False, "publish global_frame_id -> odometry frame on /tf while localized (REP-105)")
-    tf_tolerance_s: float = option(0.2, "how far ahead of its scan that transform is stamped", low=0.0, high=10.0)
+    odometry_timeout_s: float = option(0.02, "how long a scan waits for the odometry of its stamp", low=0.0, high=1.0)
+    tf_broadcast: bool = option(False, "publish global_frame_id -> odometry frame on /tf while localized (REP-105)")
+    transform_tolerance: float = option(0.2, "how far ahead of its scan that transform is stamped", low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)
@@ -295,7 +349,7 @@ class TrainConfig:
     clip_norm: float = option(5.0, "longest gradient; 0 = any", low=0.0, high=1e6)
     ema_decay: float = option(0.99, "of the averaged weights, once warm", low=0.0, high=1.0)
     headings: int = option(1, "1: learn not to mind the heading; more: the query is tried in so many", low=1, high=64)
-    turns: int = option(1, "with one heading: turns over which a query's descriptor is averaged", low=1, high=64)
+    rotations: int = option(1, "with one heading: test-time rotations that are averaged", low=1, high=64)
     offset_m: float = option(9.5, "a submap's centre lies at most so far from its scan, each way", low=0.0, high=100.0)
     neighbour_m: float = option(20.0, "nearer places of one town are neither match nor mismatch", low=0.0, high=1e4)
     near_share: float = option(0.5, "share of places drawn near another of the batch: hard negatives", low=0, high=1)
@@ -330,8 +384,8 @@ class TrainConfig:
             raise ConfigError(f"'milestones' must ascend, got {self.milestones}")
         if self.precision == "bfloat16" and self.device == "cpu":
             raise ConfigError("'precision' bfloat16 needs the device cuda")
-        if self.headings > 1 and self.turns > 1:
-            raise ConfigError("'turns' averages over headings, which 'headings' above 1 tells apart: set one to 1")
+        if self.headings > 1 and self.rotations > 1:
+            raise ConfigError("'rotations' averages over headings, which 'headings' above 1 tells apart: set one to 1")
         if self.augmentation == "paper" and self.headings > 1:
             raise ConfigError("the paper's augmentation does not teach several headings: 'headings' must be 1")
 
@@ -373,9 +427,24 @@ def from_dict(kind: type[T], values: Mapping[str, Any], *, where: str = "") -> T
     for key, value in values.items():
         name = f"{where}{key}"
         if key not in fields:
-            raise ConfigError(f"unknown setting '{name}'; known are: {', '.join(sorted(fields))}")
+            raise ConfigError(unknown_setting(name, sorted(fields)))
         arguments[key] = check_value(name, hints[key], value, fields[key].metadata)
     return kind(**arguments)
+
+
+def unknown_setting(name: str, known: Iterable[str], noun: str = "setting") -> str:
+    """Return the message for a name that no field has: what it is called now, what it may have meant, or what exists.
+
+    `known` are the names that `name` may have been, without the groups that precede them in `name`.
+    """
+    if name in RENAMED:
+        return f"{noun} '{name}' is now called '{RENAMED[name]}'"
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1) or difflib.get_close_matches(
+        name.rpartition(".")[2], names, n=1
+    )
+    hint = f"did you mean '{close[0]}'?" if close else f"known are: {', '.join(names)}"
+    return f"unknown {noun} '{name}': {hint}"
 
 
 def check_value(name: str, hint: Any, value: Any, metadata: Mapping[str, Any]) -> Any:

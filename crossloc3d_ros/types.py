@@ -267,5 +267,5 @@ class HeadingEncoder(Protocol):
         """Return in how many headings, evenly over the circle, a query is tried; 1 = the descriptor is free of it."""
 
     @property
-    def turns(self) -> int:
+    def rotations(self) -> int:
         """Return over how many turns, evenly over the circle, the descriptor of a heading is averaged; 1 = none."""

@@ -16,7 +16,7 @@ SETTINGS = {
     "weights": (str, "weights file; the shipped weights where none is named"),
     "autostart": (bool, "whether the node configures and activates itself"),
     "odometry": (str, "topic, scan or none: what tells how the robot has moved"),
-    "publish_tf": (bool, "whether map -> odom goes to /tf while localized"),
+    "tf_broadcast": (bool, "whether map -> odom goes to /tf while localized"),
     "use_sim_time": (bool, "whether the time comes from /clock"),
 }
 """Parameters that can be given as arguments; what is left empty stays as the parameter file has it."""

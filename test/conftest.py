@@ -18,9 +18,9 @@ from crossloc3d_ros.config import (
     AlignmentConfig,
     BuildConfig,
     CalibrationConfig,
-    CredibilityConfig,
     LocalizerConfig,
     PreprocessingConfig,
+    RetrievalConfig,
 )
 from crossloc3d_ros.localization.localizer import Localizer
 
@@ -216,7 +216,7 @@ class HeightHistogram:
         from crossloc3d_ros.config import CalibrationConfig, PreprocessingConfig
 
         self.preprocessing = PreprocessingConfig()
-        self.calibration = CalibrationConfig(temperature=0.01, none_distance=0.2, none_scale=0.02)
+        self.calibration = CalibrationConfig(temperature=0.01, null_distance=0.2, null_scale=0.02)
 
     def encode(self, points: np.ndarray) -> np.ndarray:
         radius = np.hypot(points[:, 0], points[:, 1])
@@ -262,7 +262,7 @@ class RingHistogram:
     preprocessing = PreprocessingConfig(
         half_extent_m=30.0, scan_half_extent_m=30.0, n_points=2048, min_points=40, thin_m=1.0
     )
-    calibration = CalibrationConfig(temperature=0.01, none_distance=0.2, none_scale=0.02)
+    calibration = CalibrationConfig(temperature=0.01, null_distance=0.2, null_scale=0.02)
 
     def encode(self, points: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         radius = np.hypot(points[:, 0], points[:, 1])
@@ -286,5 +286,5 @@ def town_map(town_drive, tmp_path_factory: pytest.TempPathFactory) -> AerialMap:
 @pytest.fixture(scope="session")
 def localizer(town_map: AerialMap) -> Localizer:
     """Places by retrieval alone: scans in any heading, 8 m and half a second apart, are no drive to be followed."""
-    credibility, alignment = CredibilityConfig(min_probability=0.3), AlignmentConfig(search="off")
-    return Localizer(town_map, RingHistogram(), LocalizerConfig(credibility=credibility, alignment=alignment))
+    credibility, alignment = RetrievalConfig(min_probability=0.3), AlignmentConfig(scope="none")
+    return Localizer(town_map, RingHistogram(), LocalizerConfig(retrieval=credibility, alignment=alignment))

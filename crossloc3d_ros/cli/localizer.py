@@ -28,7 +28,7 @@ publishes   ~/fix                            sensor_msgs/NavSatFix, one for each
             ~/markers                        visualization_msgs/MarkerArray
             ~/map_origin                     sensor_msgs/NavSatFix, latched: where the frame `map` has its origin
             /diagnostics                     diagnostic_msgs/DiagnosticArray
-            /tf                              from `map` to the odometry's frame, where publish_tf is set
+            /tf                              from `map` to the odometry's frame, where tf_broadcast is set
 service     reinitialize_global_localization std_srvs/Empty
 
 parameters

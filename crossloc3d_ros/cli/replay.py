@@ -96,9 +96,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     localize.add_argument("--odom-topic", help="Odometry topic (default: the only one beside ground truth, or /odom)")
     localize.add_argument(
-        "--search",
-        choices=typing.get_args(typing.get_type_hints(AlignmentConfig)["search"]),
-        help="where poses are sought (default: as the parameter alignment.search of the node)",
+        "--scope",
+        choices=typing.get_args(typing.get_type_hints(AlignmentConfig)["scope"]),
+        help="where poses are searched (default: as the parameter alignment.scope of the node)",
     )
     localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
     localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
@@ -128,8 +128,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     target = console()
     set_up_logging(arguments.verbose, target)
     config = read_config(arguments.config, _given(arguments, MountingConfig), _given(arguments, LocalizerNodeConfig))
-    if arguments.search is not None:
-        config = replace(config, alignment=replace(config.alignment, search=arguments.search))
+    if arguments.scope is not None:
+        config = replace(config, alignment=replace(config.alignment, scope=arguments.scope))
     if not config.map:
         raise ConfigError(f"--map is needed: {arguments.config} names none")
     folder = arguments.output or Path("out") / "replay" / arguments.bag.resolve().stem

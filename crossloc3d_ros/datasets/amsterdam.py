@@ -92,7 +92,7 @@ def settings_of(benchmark: AmsterdamBenchmark, surveys: Path, preprocessing: Pre
     settings = dataclasses.asdict(benchmark)
     for name in ("workers", "chunk_points"):  # how the builder works, not what comes out
         del settings["build"][name]
-    for name in ("turn_s", "stamped_at"):  # how stamps are read, not what is seen
+    for name in ("period_s", "stamped_at"):  # how stamps are read, not what is seen
         del settings["scan"][name]
     for name in (MAP_SURVEY, DRIVE_SURVEY):
         if not (surveys / name).is_file():

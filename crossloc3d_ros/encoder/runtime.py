@@ -8,7 +8,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PreprocessingConfig, from_dict, usable_threads
+from crossloc3d_ros.config import (
+    CalibrationConfig,
+    ModelConfig,
+    PreprocessingConfig,
+    from_dict,
+    to_dict,
+    usable_threads,
+)
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D
@@ -41,7 +48,7 @@ class Encoder:
         self.metadata = dict(metadata or {})
         self._calibration = _calibration(self.metadata)
         self._headings = _count(self.metadata, "headings")
-        self._turns = _count(self.metadata, "turns")
+        self._rotations = _count(self.metadata, "turns")
 
     @property
     def fingerprint(self) -> str:
@@ -72,13 +79,13 @@ class Encoder:
         return self._headings
 
     @property
-    def turns(self) -> int:
+    def rotations(self) -> int:
         """Return over how many turns a query's descriptor is averaged, where the heading is free.
 
         What has learned not to mind the heading minds it a little: the mean over some turns minds it less. Stored
         with the weights, because the calibration is that of the averaged descriptors.
         """
-        return self._turns
+        return self._rotations
 
     @property
     def descriptor_size(self) -> int:
@@ -109,11 +116,22 @@ class Encoder:
         self.encode(spread.astype(np.float32))
 
 
+_STORED_CALIBRATION = {"none_distance": "null_distance", "none_scale": "null_scale"}
+"""The names that the weights' format, crossloc3d_ros/1, gives to settings."""
+
+
+def stored_calibration(calibration: CalibrationConfig) -> str:
+    """Return a calibration as the weights' metadata hold it, under `credibility`."""
+    names = {name: stored for stored, name in _STORED_CALIBRATION.items()}
+    return json.dumps({names.get(name, name): value for name, value in to_dict(calibration).items()})
+
+
 def _calibration(metadata: Mapping[str, str]) -> CalibrationConfig | None:
     if "credibility" not in metadata:
         return None
     try:
-        return from_dict(CalibrationConfig, json.loads(metadata["credibility"]))
+        stored = json.loads(metadata["credibility"])
+        return from_dict(CalibrationConfig, {_STORED_CALIBRATION.get(key, key): stored[key] for key in stored})
     except (json.JSONDecodeError, AttributeError, ConfigError) as error:
         raise CheckpointError(f"the calibration in the weights cannot be used ({error}); export them again") from error
 

@@ -40,8 +40,8 @@ class Localizer:
         self.aerial_map = aerial_map
         self.encoder = encoder
         self.config = config
-        self.calibration = effective_calibration(config.credibility, encoder)
-        self._aligner = None if config.alignment.search == "off" else Aligner(aerial_map, config.alignment)
+        self.calibration = effective_calibration(config.retrieval, encoder)
+        self._aligner = None if config.alignment.scope == "none" else Aligner(aerial_map, config.alignment)
         self._tracker = Tracker(config.fusion)
         self._looks = Looks(config.alignment)
 
@@ -75,7 +75,7 @@ class Localizer:
         watch.lap("encode_ms")
         found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
         candidates = _first(found, self.config.top_k)
-        place = judge(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.credibility)
+        place = judge(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
@@ -148,10 +148,10 @@ class Localizer:
             return no_aligned_poses()
         alignment.follow(hypotheses)
         if not self._tracker.skips:
-            if looks.around(stamp_ns) and config.search != "exhaustive":
+            if looks.around(stamp_ns) and config.scope != "map":
                 alignment.look_around()
             if aligner.searches_everywhere:
-                is_enough = config.search == "auto" and alignment.is_convincing()
+                is_enough = config.scope == "auto" and alignment.is_convincing()
                 if not is_enough and looks.everywhere(stamp_ns):
                     alignment.look_everywhere()
         return alignment.result()
@@ -161,7 +161,7 @@ class Localizer:
         since = self._tracker.stamp_ns
         if motion is None or not motion.is_known or since is None or stamp_ns <= since:
             return np.zeros(3)
-        seconds = (self.config.scan.stamped_at - 0.5) * self.config.scan.turn_s
+        seconds = (self.config.scan.stamped_at - 0.5) * self.config.scan.period_s
         return np.asarray(motion.delta * (seconds / ((stamp_ns - since) * 1e-9)))
 
 
@@ -180,11 +180,15 @@ class Looks:
     def around(self, stamp_ns: int) -> bool:
         """Return whether the candidates' surroundings are due; then they are taken as looked at."""
         is_localized = self.state is TrackState.LOCALIZED
-        return self._due("around", stamp_ns, self._config.look_every_s if is_localized else self._config.search_every_s)
+        return self._due(
+            "around",
+            stamp_ns,
+            self._config.candidates_period_localized_s if is_localized else self._config.candidates_period_s,
+        )
 
     def everywhere(self, stamp_ns: int) -> bool:
         """Return whether the whole map is due; then it is taken as looked at."""
-        return self._due("everywhere", stamp_ns, self._config.exhaustive_every_s)
+        return self._due("everywhere", stamp_ns, self._config.map_period_s)
 
     def _due(self, which: str, stamp_ns: int, every_s: float) -> bool:
         last_ns = self._last_ns.get(which)

@@ -90,7 +90,7 @@ TF_PERIOD_S = 0.1
 SAME_CLOCK_NS = 10_000_000_000
 """An initial pose whose stamp lies farther from the next cloud's is taken for that cloud: another clock stamped it."""
 HEADING_AGE_NS = 500_000_000
-SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "credibility.", "alignment.", "fusion.")
+SETTINGS_OF_LOCALIZE = ("top_k", "scan.", "retrieval.", "alignment.", "fusion.")
 """Parameters that a running node takes up at once; the others need a new configuration of the node."""
 
 
@@ -153,7 +153,7 @@ class LocalizerNode(LifecycleNode):
         """What the worker does before the next scan, given its stamp: nobody else touches the hypotheses."""
         self._initial_pose = ""
         self._initial_pose_timer: Any = None
-        self._worker = Worker(self._process, "localize", self._config.most_waiting)
+        self._worker = Worker(self._process, "localize", self._config.queue_depth)
         self._statistics = Statistics()
         self._complaint = ""
         self._last_status: FixStatus | None = None
@@ -240,20 +240,20 @@ class LocalizerNode(LifecycleNode):
             if not config.base_frame_id:
                 raise ConfigError("mounting_from_tf needs a base_frame_id")
             self._transforms = TransformSource(self, config.base_frame_id)
-        if config.publish_tf:
+        if config.tf_broadcast:
             if config.odometry != "topic":
-                raise ConfigError("publish_tf needs odometry from a topic: it is that frame which it places in the map")
-            self._map_transform = MapTransform(self, config.global_frame_id, round(1e9 * config.tf_tolerance_s))
+                raise ConfigError("tf_broadcast needs odometry from a topic: that is the frame whose pose it publishes")
+            self._map_transform = MapTransform(self, config.global_frame_id, round(1e9 * config.transform_tolerance))
         if config.odometry == "topic":
             on_base = None if self._transforms is None else self._transforms.pose_on_base
             self._odometry = OdometryInput(
-                OdometryBuffer(config.fusion), config.base_frame_id, config.odometry_wait_s, on_base
+                OdometryBuffer(config.fusion), config.base_frame_id, config.odometry_timeout_s, on_base
             )
         elif config.odometry == "scan":
             self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m)
         self._gravity = GravityFilter(config.imu_time_constant_s)
         self._localizer = localizer = self._load(config)
-        self._worker = Worker(self._process, "localize", config.most_waiting)
+        self._worker = Worker(self._process, "localize", config.queue_depth)
         self._outputs = {
             "fix": self.create_lifecycle_publisher(NavSatFix, "~/fix", 10),
             "pose": self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),

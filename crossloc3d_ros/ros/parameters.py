@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -11,7 +10,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from crossloc3d_ros.config import Setting, check_value, from_dict, settings_of
+from crossloc3d_ros.config import Setting, check_value, from_dict, settings_of, unknown_setting
 from crossloc3d_ros.errors import ConfigError
 
 T = TypeVar("T")
@@ -110,8 +109,7 @@ class ConfigParameters(Generic[T]):
         known = list(self._settings)
         if name.startswith("qos_overrides."):
             return f"unknown parameter '{name}': QoS can be overridden for {', '.join(self._topics)}"
-        close = difflib.get_close_matches(name, known, n=1)
-        return f"unknown parameter '{name}'" + (f": did you mean '{close[0]}'?" if close else "")
+        return unknown_setting(name, known, "parameter")
 
     def _declare(self, overrides: Mapping[str, Any]) -> None:
         from_dict(self._kind, _nested(overrides))

@@ -61,8 +61,8 @@ class MapTransform:
             import tf2_ros
         except ImportError as error:
             raise ConfigError(
-                "publish_tf needs tf2_ros, which is not installed: install ros-jazzy-tf2-ros-py, "
-                "or set publish_tf to false and take the pose from ~/pose"
+                "tf_broadcast needs tf2_ros, which is not installed: install ros-jazzy-tf2-ros-py, "
+                "or set tf_broadcast to false and take the pose from ~/pose"
             ) from error
         self._global_frame_id = global_frame_id
         self._tolerance_ns = tolerance_ns

@@ -17,11 +17,11 @@ T = TypeVar("T")
 class Worker(Generic[T]):
     """Work on the items handed over, one at a time, in a thread of its own."""
 
-    def __init__(self, work: Callable[[T], None], name: str, most_waiting: int = 1) -> None:
+    def __init__(self, work: Callable[[T], None], name: str, queue_depth: int = 1) -> None:
         """Prepare a worker that calls `work`, which must not raise; nothing runs before `start`."""
         self._work = work
         self._name = name
-        self._most_waiting = most_waiting
+        self._most_waiting = queue_depth
         self._changed = threading.Condition()
         self._waiting: deque[T] = deque()
         self._thread: threading.Thread | None = None

@@ -127,7 +127,7 @@ def rows_of(table: TableName, base: TrainConfig) -> list[Row]:
             Row(
                 f"headings_{count}",
                 "heading learned away" if count == 1 else f"{count} headings tried",
-                dataclasses.replace(base, model=model, headings=count, turns=base.turns if count == 1 else 1),
+                dataclasses.replace(base, model=model, headings=count, rotations=base.rotations if count == 1 else 1),
                 is_reference=count == base.headings,
             )
             for count in counts

@@ -198,7 +198,7 @@ class Trainer:
     ) -> Validation:
         began = time.monotonic()
         config = self.config
-        validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.turns)
+        validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.rotations)
         log.write(
             "validation", step=state.step, elapsed_s=round(state.elapsed_s, 1),
             seconds=round(time.monotonic() - began, 1), **asdict(validation),
@@ -255,7 +255,7 @@ def export_run(folder: Path, output: Path, places: Sequence[Path] = ()) -> Path:
     state.load_dict(saved)
     model = with_fresh_norms(state.averaged, material.sampler(config), config)
     held_out = material.validation_towns(config)
-    validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.turns)
+    validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.rotations)
     output.parent.mkdir(parents=True, exist_ok=True)
     notes = run_folder.metadata(config, state.step, state.elapsed_s, validation, run_folder.history(folder))
     run_folder.export(output, model, config, notes)

@@ -82,8 +82,8 @@ def _introduction(config: TrainConfig, material: Material, history: Sequence[dic
             f"The heading of a query matters: it is encoded in {config.headings} headings, and the nearest descriptor "
             "counts, which tells the heading besides."
         )
-    elif config.turns > 1:
-        query = f"A query's descriptor is the mean over {config.turns} turns of it; its heading does not matter."
+    elif config.rotations > 1:
+        query = f"A query's descriptor is the mean over {config.rotations} turns of it; its heading does not matter."
     else:
         query = "The heading of a query does not matter."
     return (

@@ -19,6 +19,7 @@ import torch
 from crossloc3d_ros.config import TrainConfig, from_dict, to_dict
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.checkpoint import save_checkpoint
+from crossloc3d_ros.encoder.runtime import stored_calibration
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training.initial import HISTORY, Initial, read_initial
 from crossloc3d_ros.training.material import Material
@@ -33,7 +34,7 @@ FINAL = "final.safetensors"
 MODEL_CARD = "MODEL_CARD.md"
 CURVE = "progress.html"
 
-_FREE_TO_CHANGE = {"threads", "workers", "device", "save_minutes", "validation_minutes", "log_steps", "turns"}
+_FREE_TO_CHANGE = {"threads", "workers", "device", "save_minutes", "validation_minutes", "log_steps", "rotations"}
 """Settings that a resumed run may change: they do not touch the weights."""
 
 
@@ -232,13 +233,13 @@ def metadata(
     recalls = {f"{r.label}@{r.radius_m:.0f}m": round(r.value, 4) for r in validation.recalls}
     training = {"steps": step, "hours": round(elapsed_s / 3600.0, 3), "pairs": config.pairs, "seed": config.seed}
     return {
-        "credibility": json.dumps(to_dict(validation.calibration)),
+        "credibility": stored_calibration(validation.calibration),
         "distances": json.dumps(distances),
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
         "examined": json.dumps({"kind": "validation", "step": step, "elapsed_s": elapsed_s, **asdict(validation)}),
         "headings": str(config.headings),
-        "turns": str(config.turns),
+        "turns": str(config.rotations),
         HISTORY: json.dumps(chain),
     }
 

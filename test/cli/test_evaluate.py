@@ -289,10 +289,10 @@ def test_options_of_the_other_protocol_are_refused(
 
 def test_settings_are_read_as_groups() -> None:
     read = evaluate.read_settings(
-        ["top_k=5", "fusion.min_probability=0.9", "scan.mounting.z_m=1.5", "fusion.forget_s=2"]
+        ["top_k=5", "fusion.min_probability=0.9", "scan.mounting.z_m=1.5", "fusion.unknown_motion_decay_s=2"]
     )
     assert read == {
-        "top_k": 5, "fusion": {"min_probability": 0.9, "forget_s": 2}, "scan": {"mounting": {"z_m": 1.5}},
+        "top_k": 5, "fusion": {"min_probability": 0.9, "unknown_motion_decay_s": 2}, "scan": {"mounting": {"z_m": 1.5}},
     }  # fmt: skip
 
 

@@ -18,9 +18,9 @@ from crossloc3d_ros.config import (
     AlignmentConfig,
     BuildConfig,
     CalibrationConfig,
-    CredibilityConfig,
     LocalizerConfig,
     PreprocessingConfig,
+    RetrievalConfig,
 )
 from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
 from crossloc3d_ros.datasets.raw_scans import RawScan
@@ -35,7 +35,7 @@ from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 Float32 = npt.NDArray[np.float32]
 ORIGIN = np.array([628_500.0, 5_804_000.0, 2.0])
 PLACES = 30
-BY_PLACE = AlignmentConfig(search="off")  # the map of these tests has no rasters
+BY_PLACE = AlignmentConfig(scope="none")  # the map of these tests has no rasters
 STAMP_NS = 1_700_000_000_123_456_789
 
 
@@ -45,7 +45,7 @@ class HistogramEncoder:
     fingerprint = "histogram"
     descriptor_size = 64
     preprocessing = PreprocessingConfig()
-    calibration = CalibrationConfig(temperature=0.01, none_distance=0.05, none_scale=0.005)
+    calibration = CalibrationConfig(temperature=0.01, null_distance=0.05, null_scale=0.005)
 
     def encode(self, points: Float32) -> Float32:
         radius = np.hypot(points[:, 0], points[:, 1])
@@ -164,15 +164,15 @@ def test_a_scan_from_nowhere_gives_no_fix(localizer: Localizer) -> None:
 
 
 def test_settings_override_the_calibration_of_the_weights(aerial_map: AerialMap) -> None:
-    def localize(credibility: CredibilityConfig) -> Estimate:
-        config = LocalizerConfig(top_k=5, credibility=credibility, alignment=BY_PLACE)
+    def localize(credibility: RetrievalConfig) -> Estimate:
+        config = LocalizerConfig(top_k=5, retrieval=credibility, alignment=BY_PLACE)
         return Localizer(aerial_map, HistogramEncoder(), config).localize(scan_of_place(4))
 
-    assert localize(CredibilityConfig()).status is FixStatus.FIX
-    doubtful = CredibilityConfig(none_distance=1e-6, none_scale=0.01, min_probability=0.9)
+    assert localize(RetrievalConfig()).status is FixStatus.FIX
+    doubtful = RetrievalConfig(null_distance=1e-6, null_scale=0.01, min_probability=0.9)
     assert localize(doubtful).status is FixStatus.NO_FIX
-    assert localize(CredibilityConfig(temperature=1e3)).status is FixStatus.NO_FIX, "all candidates alike"
-    assert len(localize(CredibilityConfig()).candidates) == 5
+    assert localize(RetrievalConfig(temperature=1e3)).status is FixStatus.NO_FIX, "all candidates alike"
+    assert len(localize(RetrievalConfig()).candidates) == 5
 
 
 def test_warm_up_leaves_nothing_behind(aerial_map: AerialMap) -> None:
@@ -204,9 +204,9 @@ def is_right(scan: RawScan, grid: npt.NDArray[np.float64], heading_rad: float) -
     return bool(np.hypot(*(grid[:2] - scan.T_grid_base[:2, 3])) < 2.0 and turned < np.radians(5.0))
 
 
-@pytest.mark.parametrize("search", ["retrieval", "exhaustive", "auto"])
-def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, AerialMap, Any], search: Any) -> None:
-    localizer = in_town(town, search=search)
+@pytest.mark.parametrize("scope", ["candidates", "map", "auto"])
+def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, AerialMap, Any], scope: Any) -> None:
+    localizer = in_town(town, scope=scope)
     right = believed = 0
     scans = [scan for scan in town[0].scans if town[0].on_map[scan.area]]
     for scan in scans:
@@ -216,7 +216,7 @@ def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, Aerial
         right += is_right(scan, aligned.grid[0], float(aligned.heading_rad[0]))
         assert aligned.probabilities.sum() <= 1.0 + 1e-9
         assert estimate.timings.align_ms > 0.0
-        if search == "exhaustive":
+        if scope == "map":
             assert estimate.status is FixStatus.NO_FIX, "one scan alone is no fix"
         if estimate.state is not TrackState.SEARCHING and np.isfinite(estimate.T_map_base).all():
             believed += 1
@@ -228,9 +228,9 @@ def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, Aerial
     assert believed >= 3
 
 
-@pytest.mark.parametrize("search", ["retrieval", "auto"])
-def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, Any], search: Any) -> None:
-    localizer = in_town(town, search=search)
+@pytest.mark.parametrize("scope", ["candidates", "auto"])
+def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, Any], scope: Any) -> None:
+    localizer = in_town(town, scope=scope)
     motion = Motion(np.array([6.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.01]))
     outside = [scan for scan in town[0].scans if not town[0].on_map[scan.area]]
     for i, scan in enumerate(outside * 2):
@@ -257,7 +257,7 @@ def drive(pose_set: PoseSet, start: RawScan, metres: Sequence[float]) -> list[Ra
 
 def test_a_drive_leads_to_a_fix_and_being_carried_away_ends_it(town: tuple[PoseSet, AerialMap, Any]) -> None:
     pose_set = town[0]
-    localizer = in_town(town, search="auto")
+    localizer = in_town(town, scope="auto")
     ahead = Motion(np.array([2.0, 0.0, 0.0]), np.diag([0.05, 0.05, 0.01]) ** 2)
     states, stamp_ns = [], STAMP_NS
     for scan in drive(pose_set, pose_set.scans[4], np.arange(-12.0, 6.0, 2.0)):
@@ -286,7 +286,7 @@ def upside_down(scan: RawScan) -> RawScan:
 
 
 def test_a_scan_upside_down_is_no_pose(town: tuple[PoseSet, AerialMap, Any]) -> None:
-    localizer = in_town(town, search="auto")
+    localizer = in_town(town, scope="auto")
     for i, scan in enumerate(town[0].scans[:4]):
         estimate = seen(localizer, upside_down(scan), STAMP_NS + i * 1_000_000_000)
         assert estimate.status is FixStatus.NO_FIX
@@ -296,7 +296,7 @@ def test_a_scan_upside_down_is_no_pose(town: tuple[PoseSet, AerialMap, Any]) -> 
 
 def test_an_empty_scan_leaves_everything_as_it_was(town: tuple[PoseSet, AerialMap, Any]) -> None:
     empty = Scan(np.empty((0, 3), np.float32), STAMP_NS + 50_000_000, "velodyne")
-    plain, disturbed = (in_town(town, search="retrieval") for _ in range(2))
+    plain, disturbed = (in_town(town, scope="candidates") for _ in range(2))
     motion = Motion(np.zeros(3), np.diag([0.01, 0.01, 0.001]))
     for localizer in (plain, disturbed):
         seen(localizer, town[0].scans[0])
@@ -309,7 +309,7 @@ def test_an_empty_scan_leaves_everything_as_it_was(town: tuple[PoseSet, AerialMa
 
 
 def test_reset_forgets_everything(town: tuple[PoseSet, AerialMap, Any]) -> None:
-    fresh, used = (in_town(town, search="auto") for _ in range(2))
+    fresh, used = (in_town(town, scope="auto") for _ in range(2))
     first, second = town[0].scans[0], town[0].scans[1]
     seen(used, first)
     assert used.stamp_ns == STAMP_NS
@@ -324,7 +324,7 @@ def test_reset_forgets_everything(town: tuple[PoseSet, AerialMap, Any]) -> None:
 
 
 def test_switched_off_there_are_places_but_no_poses(town: tuple[PoseSet, AerialMap, Any]) -> None:
-    estimate = seen(in_town(town, search="off"), town[0].scans[0])
+    estimate = seen(in_town(town, scope="none"), town[0].scans[0])
     assert len(estimate.aligned) == len(estimate.hypotheses) == 0
     assert len(estimate.candidates) == 25
     assert np.isfinite(estimate.grid).all()
@@ -337,7 +337,7 @@ def test_a_pose_is_that_at_the_stamp_not_in_the_middle_of_the_turn(town: tuple[P
     still = Motion(np.zeros(3), motion.covariance)
     found = []
     for given in (still, motion):
-        localizer = in_town(town, search="retrieval")
+        localizer = in_town(town, scope="candidates")
         seen(localizer, scan)
         aligned = seen(localizer, scan, later_ns, given).aligned
         row = int(np.flatnonzero(aligned.source >= 0)[0])

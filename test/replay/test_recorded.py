@@ -11,6 +11,7 @@ import pytest
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import BagError
+from crossloc3d_ros.evaluation.drives import evaluation as drive_evaluation
 from crossloc3d_ros.evaluation.drives.estimates import read_estimates
 from crossloc3d_ros.evaluation.drives.page import About, write_report
 from crossloc3d_ros.formats import bag
@@ -23,19 +24,21 @@ def folder(town_drive, localizer: Localizer, tmp_path_factory: pytest.TempPathFa
     """The results of the whole drive."""
     folder = tmp_path_factory.mktemp("replay")
     with bag.open_bag(town_drive.bag) as reader:
-        replay.localize_bag(reader, "/velodyne_points", localizer, folder / replay.ESTIMATES)
+        replay.localize_bag(reader, "/velodyne_points", localizer, folder / drive_evaluation.ESTIMATES)
     return folder
 
 
 @pytest.fixture(scope="module")
-def evaluation(folder: Path, town_drive, town_map: AerialMap) -> replay.Evaluation:
+def evaluation(folder: Path, town_drive, town_map: AerialMap) -> drive_evaluation.Evaluation:
     with bag.open_bag(town_drive.bag) as reader:
-        evaluation = replay.evaluate(reader, folder, town_map)
-    replay.write_summary(folder, evaluation, {"bag": "drive"})
+        evaluation = drive_evaluation.evaluate(reader, folder, town_map)
+    drive_evaluation.write_summary(folder, evaluation, {"bag": "drive"})
     return evaluation
 
 
-def test_every_scan_gets_a_row_and_the_truth_is_where_it_was(town_drive, evaluation: replay.Evaluation) -> None:
+def test_every_scan_gets_a_row_and_the_truth_is_where_it_was(
+    town_drive, evaluation: drive_evaluation.Evaluation
+) -> None:
     table = evaluation.table
     assert table.stamp_ns.tolist() == town_drive.stamps_ns.tolist()
     assert evaluation.truth is not None
@@ -46,7 +49,7 @@ def test_every_scan_gets_a_row_and_the_truth_is_where_it_was(town_drive, evaluat
     np.testing.assert_allclose(table.truth_grid[known], town_drive.truth[known, :2], atol=0.02)
 
 
-def test_a_localizer_that_sees_well_scores_well(evaluation: replay.Evaluation) -> None:
+def test_a_localizer_that_sees_well_scores_well(evaluation: drive_evaluation.Evaluation) -> None:
     scores = evaluation.scores
     assert scores is not None
     assert scores.scored == len(evaluation.table) - 1
@@ -60,7 +63,7 @@ def test_a_localizer_that_sees_well_scores_well(evaluation: replay.Evaluation) -
 def test_straight_through_is_what_the_localizer_says(town_drive, localizer: Localizer, folder: Path) -> None:
     from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 
-    table = read_estimates(folder / replay.ESTIMATES)
+    table = read_estimates(folder / drive_evaluation.ESTIMATES)
     with bag.open_bag(town_drive.bag) as reader:
         message = next(m for i, (_, _, m) in enumerate(reader.messages(["/velodyne_points"])) if i == 3)
     estimate = localizer.localize(scan_from_pointcloud2(message))
@@ -87,12 +90,12 @@ def test_a_bag_without_gnss_is_localized_and_not_scored(
         for _, t_ns, message in list(reader.messages(["/velodyne_points"]))[:3]:
             writer.write("/velodyne_points", bag.POINT_CLOUD, t_ns, message)
     with bag.open_bag(tmp_path / "blind") as reader:
-        replay.localize_bag(reader, "/velodyne_points", localizer, tmp_path / replay.ESTIMATES)
-        evaluation = replay.evaluate(reader, tmp_path, town_map)
+        replay.localize_bag(reader, "/velodyne_points", localizer, tmp_path / drive_evaluation.ESTIMATES)
+        evaluation = drive_evaluation.evaluate(reader, tmp_path, town_map)
     assert evaluation.scores is None
     assert evaluation.truth is None
-    replay.write_summary(tmp_path, evaluation, {})
-    assert json.loads((tmp_path / replay.SUMMARY).read_text())["scores"] is None
+    drive_evaluation.write_summary(tmp_path, evaluation, {})
+    assert json.loads((tmp_path / drive_evaluation.SUMMARY).read_text())["scores"] is None
     write_report(tmp_path / "page.html", evaluation, town_map, About("Blind", {}))
     assert "could be checked" in (tmp_path / "page.html").read_text()
 
@@ -120,8 +123,8 @@ def test_hopeless_clouds_become_rows_without_a_fix_that_say_why(
         for i, (_, cloud) in enumerate(clouds):
             writer.write("/points", bag.POINT_CLOUD, 1_700_000_000_000_000_000 + i, cloud)
     with bag.open_bag(tmp_path / "drive") as reader:
-        replay.localize_bag(reader, "/points", localizer, tmp_path / replay.ESTIMATES)
-        evaluation = replay.evaluate(reader, tmp_path, town_map)
+        replay.localize_bag(reader, "/points", localizer, tmp_path / drive_evaluation.ESTIMATES)
+        evaluation = drive_evaluation.evaluate(reader, tmp_path, town_map)
     table = evaluation.table
     assert len(table) == len(clouds)
     assert not table.has_fix.any()
@@ -173,8 +176,8 @@ def test_an_imu_levels_the_scans(town_drive, localizer: Localizer, tmp_path: Pat
     assert np.median(found["/imu"]) < np.median(found[None])
 
 
-def test_the_summary_says_what_the_table_says(folder: Path, evaluation: replay.Evaluation) -> None:
-    summary = json.loads((folder / replay.SUMMARY).read_text())
+def test_the_summary_says_what_the_table_says(folder: Path, evaluation: drive_evaluation.Evaluation) -> None:
+    summary = json.loads((folder / drive_evaluation.SUMMARY).read_text())
     assert evaluation.scores is not None
     assert summary["scans"] == len(evaluation.table)
     assert summary["scores"]["scored"] == evaluation.scores.scored

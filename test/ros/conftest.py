@@ -102,7 +102,7 @@ class World:
     map_path: Path
     weights_path: Path
     other_weights_path: Path
-    none_distance: float
+    null_distance: float
     """Half of what lies between the two places that look most alike."""
 
     def parameters(self) -> dict[str, object]:
@@ -110,9 +110,9 @@ class World:
             "map": str(self.map_path),
             "weights": str(self.weights_path),
             "threads": 1,
-            "credibility.none_distance": self.none_distance,
-            "credibility.none_scale": self.none_distance / 20,
-            "credibility.temperature": self.none_distance / 10,
+            "retrieval.null_distance": self.null_distance,
+            "retrieval.null_scale": self.null_distance / 20,
+            "retrieval.temperature": self.null_distance / 10,
         }
 
     @staticmethod
@@ -147,8 +147,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
         patches.append(patch.points)
     descriptors = np.concatenate([encoder.encode_batch([patch]) for patch in patches])
     gaps = np.linalg.norm(descriptors[:, None] - descriptors[None], axis=-1)
-    none_distance = 0.5 * float(gaps[np.triu_indices(PLACES, 1)].min())
-    assert none_distance > 1e-4, "weights without training must tell these places apart"
+    null_distance = 0.5 * float(gaps[np.triu_indices(PLACES, 1)].min())
+    assert null_distance > 1e-4, "weights without training must tell these places apart"
 
     map_path = folder / "map"
     map_path.mkdir()
@@ -165,7 +165,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
         files=store.file_records(map_path), created="2024-01-01T00:00:00Z", software="test",
     )  # fmt: skip
     store.write_manifest(map_path, manifest)
-    return World(map_path, folder / "weights.safetensors", folder / "other.safetensors", none_distance)
+    return World(map_path, folder / "weights.safetensors", folder / "other.safetensors", null_distance)
 
 
 @pytest.fixture(scope="session")

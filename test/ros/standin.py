@@ -37,7 +37,7 @@ class StandIn:
 
     def __init__(self, aerial_map: AerialMap, encoder: Any, config: LocalizerNodeConfig) -> None:
         self.aerial_map, self.encoder, self.config = aerial_map, encoder, config
-        self.calibration = effective_calibration(config.credibility, encoder)
+        self.calibration = effective_calibration(config.retrieval, encoder)
         self.prior: Any = None
         self.resets = 0
         self.stamp_ns: int | None = None

@@ -49,7 +49,7 @@ TABLE = np.dtype(
 @pytest.fixture(scope="module")
 def localizer(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
     """One node for all tests that leave it as they find it: active, with its own settings, TF and all inputs."""
-    own = {"publish_tf": True, "use_imu_heading": True}
+    own = {"tf_broadcast": True, "use_imu_heading": True}
     node = start_stand_in({**world.parameters(), **own}, environment={"STANDIN_TF2": "1"})
     node.wait_for_output("listening on /points")
     yield node
@@ -648,8 +648,8 @@ def truncated_map(folder: Path, world: World) -> Path:
         pytest.param({"--params-file": "BROKEN"}, "broken.yaml", marks=pytest.mark.slow),
         pytest.param({"scan.mounting.z_m": "high"}, "'scan.mounting.z_m' must be of type", marks=pytest.mark.slow),
         pytest.param({"weights": "NOWHERE"}, "no such weights file", marks=pytest.mark.slow),
-        ({"publish_tf": True, "odometry": "none"}, "publish_tf needs odometry from a topic"),
-        pytest.param({"publish_tf": True}, "publish_tf needs tf2_ros, which is not", marks=pytest.mark.slow),
+        ({"tf_broadcast": True, "odometry": "none"}, "tf_broadcast needs odometry from a topic"),
+        pytest.param({"tf_broadcast": True}, "tf_broadcast needs tf2_ros, which is not", marks=pytest.mark.slow),
         pytest.param({"mounting_from_tf": True}, "needs tf2_ros, which is not installed", marks=pytest.mark.slow),
         pytest.param(
             {"qos_overrides./points.subscription.reliability": "sometimes"}, "qos_overrides./points",

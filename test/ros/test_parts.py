@@ -78,7 +78,7 @@ def test_only_the_newest_of_those_that_wait_is_worked_on(gate: threading.Event) 
 
 def test_a_few_may_wait_and_are_worked_on_in_their_order(gate: threading.Event) -> None:
     work = HeldWork(gate)
-    worker = Worker(work, "test", most_waiting=3)
+    worker = Worker(work, "test", queue_depth=3)
     worker.start(lambda: None)
     worker.offer(0)
     assert work.begun.wait(5)

@@ -348,5 +348,5 @@ def test_a_pose_is_the_matrix_that_it_was_made_of(yaw: float, pitch: float, roll
 
 
 def test_tf_is_missed_by_name() -> None:
-    with pytest.raises(ConfigError, match="publish_tf needs tf2_ros, which is not installed"):
+    with pytest.raises(ConfigError, match="tf_broadcast needs tf2_ros, which is not installed"):
         MapTransform(None, "map", 0)

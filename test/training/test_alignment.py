@@ -57,8 +57,8 @@ def drawn(share: float, temperature: float, count: int, seed: int) -> list[Answe
 
 @pytest.mark.parametrize(("share", "temperature"), [(0.5, 12.0), (0.35, 25.0)])
 def test_the_calibration_that_made_the_answers_is_found(share: float, temperature: float) -> None:
-    found_share, found_temperature = calibrate(drawn(share, temperature, 600, 1))
-    assert found_share == pytest.approx(share, abs=0.03)
+    detection_probability, found_temperature = calibrate(drawn(share, temperature, 600, 1))
+    assert detection_probability == pytest.approx(share, abs=0.03)
     assert found_temperature == pytest.approx(temperature, rel=0.2)
 
 

@@ -12,8 +12,8 @@ import torch
 import yaml
 
 from crossloc3d_ros.cli import train
-from crossloc3d_ros.config import CalibrationConfig, ModelConfig, PlacesConfig, TrainConfig, from_dict
-from crossloc3d_ros.encoder.checkpoint import load_checkpoint
+from crossloc3d_ros.config import ModelConfig, PlacesConfig, TrainConfig, from_dict
+from crossloc3d_ros.encoder.checkpoint import load_checkpoint, load_encoder
 from crossloc3d_ros.errors import ConfigError, TrainingError
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loop import Progress, Trainer, export_run
@@ -95,7 +95,8 @@ def test_a_finished_run_leaves_weights_that_load_with_their_calibration_and_a_ca
     assert checkpoint.preprocessing == tiny.preprocessing
     distances = json.loads(checkpoint.metadata["distances"])
     assert len(distances["true_match"]) == len(distances["quantiles"])
-    calibration = from_dict(CalibrationConfig, json.loads(checkpoint.metadata["credibility"]))
+    calibration = load_encoder(finished / run_folder.FINAL).calibration
+    assert calibration is not None
     assert calibration.temperature > 0.0
     card = (finished / run_folder.MODEL_CARD).read_text()
     for words in ("R@1", "chance", "--budget-steps 2", "seed 1", "What it cannot do"):

@@ -133,8 +133,8 @@ def way_of(encoder: DescriptorEncoder) -> tuple[int, Way]:
     if isinstance(encoder, HeadingEncoder):
         if encoder.headings > 1:
             return encoder.headings, "nearest"
-        if encoder.turns > 1:
-            return encoder.turns, "mean"
+        if encoder.rotations > 1:
+            return encoder.rotations, "mean"
     return 1, "nearest"
 
 

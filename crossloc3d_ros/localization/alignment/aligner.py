@@ -74,8 +74,8 @@ class Aligner:
     @property
     def searches_everywhere(self) -> bool:
         """Whether the whole map is searched at times: told to, or left the choice and the map is not too large."""
-        small = self.area_m2 <= 1e6 * self.config.exhaustive_km2
-        return self.config.search == "exhaustive" or (self.config.search == "auto" and small)
+        small = self.area_m2 <= 1e6 * self.config.map_max_km2
+        return self.config.scope == "map" or (self.config.scope == "auto" and small)
 
     def warm_up(self) -> None:
         """Read what an exhaustive search needs, so that the first scan does not wait for it."""
@@ -119,7 +119,7 @@ class Aligner:
 
     def prepare(self, places: Float64Array) -> None:
         """Have the map read around places (k, 3); those that are not finite are none."""
-        r = self.config.radius_m
+        r = self.config.candidate_radius_m
         for easting, northing in places[np.isfinite(places[:, :2]).all(axis=1), :2]:
             self.likelihood.prepare((easting - r, northing - r, easting + r, northing + r))
 
@@ -155,14 +155,14 @@ class Alignment:
             return
         self._aligner.prepare(self._candidates.grid)
         coarse = self._likelihood.levels[0]
-        runs = around(self._likelihood, coarse, self._places, self._config.radius_m)
-        self._look(runs, self._config.peaks, self._config.poses)
+        runs = around(self._likelihood, coarse, self._places, self._config.candidate_radius_m)
+        self._look(runs, self._config.coarse_maxima, self._config.fine_maxima)
 
     def look_everywhere(self) -> None:
         """Seek poses on the whole map."""
         self._likelihood.prepare()
         runs = inside(self._likelihood, self._likelihood.levels[0])
-        self._look(runs, PEAKS_EVERYWHERE * self._config.peaks, POSES_EVERYWHERE * self._config.poses)
+        self._look(runs, PEAKS_EVERYWHERE * self._config.coarse_maxima, POSES_EVERYWHERE * self._config.fine_maxima)
 
     def follow(self, hypotheses: Hypotheses) -> None:
         """Seek one pose for each hypothesis; those off the map as NaN are left to the climb."""
@@ -174,7 +174,7 @@ class Alignment:
     def is_convincing(self) -> bool:
         """Whether a pose is believed enough to leave the rest of the map alone."""
         probabilities = self._weighed()[2]
-        return bool(len(probabilities)) and float(probabilities.max()) >= self._config.convincing
+        return bool(len(probabilities)) and float(probabilities.max()) >= self._config.sufficient_probability
 
     def result(self) -> AlignedPoses:
         """Return where the scan fits, best first.
@@ -216,13 +216,15 @@ class Alignment:
 
     def _climbed(self, poses: Float64Array, source: Int64Array | None) -> _Climbed:
         """Return where the climb from poses (p, 3) ends, and whether candidates lie there where no source is given."""
-        peaks, rested = climb(self._some, self._likelihood, poses, reach_m=self._config.follow_m, threads=self._threads)
+        peaks, rested = climb(
+            self._some, self._likelihood, poses, reach_m=self._config.hypothesis_radius_m, threads=self._threads
+        )
         scores = scores_at(self._fine, self._likelihood, peaks.poses, self._threads)
         if source is None:
             source = np.full(len(poses), EXHAUSTIVE, np.int64)
             if len(self._places):
                 away = self._away(peaks.poses)
-                near = away.min(axis=1) <= 2.0 * self._config.radius_m
+                near = away.min(axis=1) <= 2.0 * self._config.candidate_radius_m
                 source[near] = away.argmin(axis=1)[near]
         return _Climbed(peaks.poses, scores, rested, source)
 
@@ -258,7 +260,7 @@ class Alignment:
         around_them = (poses[:, None] + _SHAPE).reshape(-1, 3)
         scores = scores_at(self._some, self._likelihood, around_them, self._threads).reshape(len(poses), -1)
         scores *= len(self._fine) / max(len(self._some), 1)  # some of the cells stand for all
-        weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.shape_temperature)
+        weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.covariance_temperature)
         weights /= weights.sum(axis=1, keepdims=True)
         offsets = _SHAPE - (weights @ _SHAPE)[:, None]
         spread = np.einsum("ps,psi,psj->pij", weights, offsets, offsets)

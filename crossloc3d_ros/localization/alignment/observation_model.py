@@ -29,7 +29,7 @@ from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array
 
-SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "alignment.safetensors"
+SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "alignment.safetensors"
 HEIGHTS_M = np.array([0.4, 1.2, 2.5, 5.0, 10.0])
 """Heights above the terrain between which the classes change."""
 _STEPS = len(HEIGHTS_M) + 1

@@ -98,12 +98,12 @@ class OdometryBuffer:
     def motion(self, from_ns: int, to_ns: int) -> Motion:
         """Return how the base moved between two stamps, by interpolation.
 
-        Beyond the newest sample it goes on as before for up to `odometry_gap_s`. Unknown where there are no samples,
-        a gap, a jump that no robot drives, or time that goes backwards.
+        Beyond the newest sample it goes on as before for up to `odometry_max_gap_s`. Unknown where there are no
+        samples, a gap, a jump that no robot drives, or time that goes backwards.
         """
         with self._lock:
             stamps, poses = self._stamps_ns, self._poses
-            gap_ns = int(self._config.odometry_gap_s * 1e9)
+            gap_ns = int(self._config.odometry_max_gap_s * 1e9)
             reason = self._why_unknown(from_ns, to_ns, gap_ns)
             if reason:
                 return unknown_motion(reason)
@@ -161,7 +161,7 @@ class OdometryBuffer:
         if after < len(stamps) and stamps[after] == stamp_ns:
             return poses[after]
         if after == len(stamps):
-            if len(stamps) == 1 or stamps[-1] - stamps[-2] > self._config.odometry_gap_s * 1e9 or self._jumps[-1]:
+            if len(stamps) == 1 or stamps[-1] - stamps[-2] > self._config.odometry_max_gap_s * 1e9 or self._jumps[-1]:
                 return poses[-1]
             after -= 1
         (x0, y0, heading0), (x1, y1, heading1) = poses[after - 1], poses[after]
@@ -177,8 +177,8 @@ class ScanOdometry:
         """Set up KISS-ICP; ConfigError where the library is not installed."""
         self._max_range_m = max_range_m
         self._odometry = _kiss_icp(max_range_m)
-        self._gap_s = max(config.odometry_gap_s, _SCAN_GAP_S)
-        self._buffer = OdometryBuffer(dataclasses.replace(config, odometry_gap_s=self._gap_s))
+        self._gap_s = max(config.odometry_max_gap_s, _SCAN_GAP_S)
+        self._buffer = OdometryBuffer(dataclasses.replace(config, odometry_max_gap_s=self._gap_s))
 
     def reset(self) -> None:
         """Forget the scans seen so far."""
@@ -209,9 +209,9 @@ class ScanOdometry:
 
 def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) -> Float64Array:
     """Return the covariance (3, 3) of a motion along a way of `length_m` with turns of `turned_rad` in all."""
-    position = (config.odometry_error * length_m) ** 2 + _STAND_STILL_M**2
-    drift = math.radians(config.odometry_turn_deg_per_m) * length_m
-    heading = (config.odometry_error * turned_rad) ** 2 + drift**2 + (0.1 * _STAND_STILL_M) ** 2
+    position = (config.odometry_relative_std * length_m) ** 2 + _STAND_STILL_M**2
+    drift = math.radians(config.odometry_drift_deg_per_m) * length_m
+    heading = (config.odometry_relative_std * turned_rad) ** 2 + drift**2 + (0.1 * _STAND_STILL_M) ** 2
     return np.diag([position, position, heading])
 
 

@@ -162,8 +162,8 @@ class Tracker:
     def set_prior(self, prior: PosePrior) -> None:
         """Take in what is known of the pose from outside; it counts from the next scan on.
 
-        A position (with or without a heading) becomes a hypothesis believed `prior_belief`. A heading alone tells
-        hypotheses and aligned poses of other headings to be less likely.
+        A position (with or without a heading) becomes a hypothesis of `initial_pose_probability`. A heading alone makes
+        hypotheses and aligned poses of other headings less likely.
         """
         if prior.grid is not None:
             self._priors.append(prior)
@@ -216,7 +216,7 @@ class Tracker:
         # Where it was missed so far, it may yet be found, the less likely the more spots it was missed at.
         # A scan that was looked at around the hypotheses alone could not find it.
         searched = bool((aligned.source >= 0).any() or (aligned.source == EXHAUSTIVE).any())
-        hope = self._elsewhere * ((1.0 - news * config.found_share) * _STALE_SHARE if searched else 1.0)
+        hope = self._elsewhere * ((1.0 - news * config.detection_probability) * _STALE_SHARE if searched else 1.0)
         hope += (1.0 - hope) * self._carried
         none = float(np.logaddexp(self._log_none, carried))
         self._elsewhere = max(float(np.exp(np.logaddexp(self._log_none + math.log(hope), carried) - none)), 1e-12)
@@ -232,7 +232,7 @@ class Tracker:
     def _move(self, elapsed_s: float, motion: Motion | None) -> None:
         config = self._config
         motion = _checked(motion, elapsed_s, config)
-        carried = -math.expm1(-config.carried_per_s * elapsed_s)
+        carried = -math.expm1(-config.kidnapping_per_s * elapsed_s)
         if motion.is_known:
             self._mixture = _moved(self._mixture, motion, config)
             way_m = float(np.hypot(*motion.delta[:2]))
@@ -244,7 +244,7 @@ class Tracker:
             self._moved_m = None
             self._trail.clear()
             self._unknown_reason = motion.reason
-            carried = 1.0 - (1.0 - carried) * math.exp(-elapsed_s / config.forget_s)
+            carried = 1.0 - (1.0 - carried) * math.exp(-elapsed_s / config.unknown_motion_decay_s)
             wide = self._mixture.covariance[:, [0, 1], [0, 1]].max(axis=1, initial=0.0) > _LARGEST_STD_M**2
             if wide.any():
                 self._to_none(self._mixture.log_weight[wide])
@@ -271,8 +271,8 @@ class Tracker:
             if prior.stamp_ns and stamp_ns > prior.stamp_ns:
                 # Where it has driven since is not asked for: it may lie anywhere on that way.
                 covariance[:2, :2] += np.eye(2) * (self._moved_m or 0.0) ** 2
-            log_belief = math.log(self._config.prior_belief)
-            log_rest = math.log1p(-self._config.prior_belief)
+            log_belief = math.log(self._config.initial_pose_probability)
+            log_rest = math.log1p(-self._config.initial_pose_probability)
             self._log_none += log_rest
             rest = dataclasses.replace(self._mixture, log_weight=self._mixture.log_weight + log_rest)
             born = _born(
@@ -290,7 +290,7 @@ class Tracker:
     def _news(self) -> float:
         """Return which share of what the scan tells is news, in [0, 1]."""
         # Of an unknown way none is granted; the first look at a spot counts in full whatever it is.
-        return -math.expm1(-(self._moved_m or 0.0) / self._config.evidence_m)
+        return -math.expm1(-(self._moved_m or 0.0) / self._config.novelty_m)
 
     def _poses(self, aligned: AlignedPoses) -> AlignedPoses:
         """Return the aligned poses that can be used, each once, with variances and likelihoods as configured."""
@@ -304,7 +304,9 @@ class Tracker:
         rows = np.flatnonzero(usable)
         rows = rows[np.argsort(-aligned.log_likelihood[rows], kind="stable")]
         covariance = _at_least(
-            aligned.covariance[rows] * config.error_scale**2, config.position_floor_m, config.heading_floor_deg
+            aligned.covariance[rows] * config.measurement_std_scale**2,
+            config.measurement_min_std_m,
+            config.measurement_min_std_deg,
         )
         offsets = _offsets(aligned.grid[rows, :2], aligned.heading_rad[rows])
         near = _squared(offsets, covariance[:, None] + covariance[None]) < _SAME
@@ -313,9 +315,9 @@ class Tracker:
             if not near[i, kept].any():
                 kept.append(i)
         rows, covariance = rows[kept], covariance[kept]
-        log_likelihood = config.evidence_weight * aligned.log_likelihood[rows]
+        log_likelihood = config.likelihood_weight * aligned.log_likelihood[rows]
         # However well a scan fits somewhere: a place that the map does not hold may look so, too.
-        log_likelihood -= max(float(log_likelihood.max(initial=0.0)) - config.evidence_limit, 0.0)
+        log_likelihood -= max(float(log_likelihood.max(initial=0.0)) - config.max_log_likelihood, 0.0)
         return AlignedPoses(
             grid=aligned.grid[rows],
             heading_rad=aligned.heading_rad[rows],
@@ -354,9 +356,9 @@ class Tracker:
         n, m = len(before), len(poses)
         if n == 0:
             return (before, np.empty(0, np.int64)), np.empty(0)
-        blind = math.log(config.blind_share)
+        blind = math.log(config.clutter_probability)
         fit = _fit(before, poses, config)
-        told = math.log1p(-config.blind_share) + fit.log_likelihood
+        told = math.log1p(-config.clutter_probability) + fit.log_likelihood
         evidence = _log_sum(np.concatenate([told, np.full((n, 1), blind)], axis=1), axis=1)
         gained, average, looks = _tempered(evidence, before, news)
         total = before.log_weight + gained
@@ -383,7 +385,7 @@ class Tracker:
         all the time, and would have fitted there as it does here. So it is granted what the likeliest hypothesis has
         banked, in proportion to how well it fits, times the belief that the search has missed it all the way.
         """
-        blind = self._config.blind_share
+        blind = self._config.clutter_probability
         log_likelihood = np.logaddexp(math.log(blind), math.log1p(-blind) + poses.log_likelihood)
         log_weight = log_open + log_prior + log_likelihood
         mixture, corrected_by = branches
@@ -396,7 +398,7 @@ class Tracker:
             followed_m = float(mixture.followed_m[leader])
             if average > 0.0 and banked > 0.0 and math.isfinite(followed_m):
                 short = banked * (np.clip(log_likelihood / average, 0.0, 1.0) - 1.0) + log_likelihood - average
-                missed = followed_m / self._config.evidence_m * math.log1p(-self._config.found_share)
+                missed = followed_m / self._config.novelty_m * math.log1p(-self._config.detection_probability)
                 late = float(mixture.log_weight[leader]) + short + missed
                 log_weight = np.where(np.isneginf(explained), np.logaddexp(log_weight, late), log_weight)
         rows = np.flatnonzero(log_weight > explained)
@@ -441,7 +443,7 @@ class Tracker:
         leader = int(np.argmax(weights))
         grid, heading, covariance, near = _estimate(mixture, weights, leader, config)
         off = np.hypot(*(mixture.mean[:, :2] - grid[:2]).T)
-        spread = np.linalg.eigvalsh(mixture.covariance[:, :2, :2] + np.eye(2) * config.map_error_m**2)[:, 1]
+        spread = np.linalg.eigvalsh(mixture.covariance[:, :2, :2] + np.eye(2) * config.map_std_m**2)[:, 1]
         # A lower bound: a circle around each hypothesis that the circle around the estimate holds.
         inside = -np.expm1(-0.5 * np.maximum(RIGHT_WITHIN_M - off, 0.0) ** 2 / spread)
         probability = float(weights @ inside)
@@ -533,24 +535,24 @@ def _fit(mixture: _Mixture, poses: AlignedPoses, config: FusionConfig) -> _Fit:
     n, m = len(mixture), len(poses)
     observation = np.zeros((m, 3, _STATE))
     observation[:, :, :3] = np.eye(3)
-    observation[:, :, 3:6] = math.sqrt(config.error_share) * _root(poses.covariance)
-    noise = (1.0 - config.error_share) * poses.covariance
+    observation[:, :, 3:6] = math.sqrt(config.measurement_error_correlation) * _root(poses.covariance)
+    noise = (1.0 - config.measurement_error_correlation) * poses.covariance
     expected = np.einsum("mij,nj->nmi", observation, mixture.mean)
     innovation = np.column_stack([poses.grid[:, :2], poses.heading_rad])[None] - expected
     innovation[..., 2] = _wrap(innovation[..., 2])
     narrow = np.einsum("mij,njk,mlk->nmil", observation, mixture.covariance, observation) + noise[None]
-    wide = narrow + np.diag([config.slip_m**2, config.slip_m**2, (0.1 * config.slip_m) ** 2])
+    wide = narrow + np.diag([config.slip_std_m**2, config.slip_std_m**2, (0.1 * config.slip_std_m) ** 2])
     likelihood = np.full((n, m), -np.inf)
     squared = _squared(innovation, narrow)
     squared_wide = _squared(innovation, wide)
     held, slipped = squared <= _GATE, (squared > _GATE) & (squared_wide <= _GATE)
-    if config.slip_share <= 0.0:
+    if config.slip_probability <= 0.0:
         slipped = np.zeros_like(held)
     peak = np.log(_determinant(poses.covariance))
     # The likelihood at the peak, spread over as wide as the hypothesis is: a wide one fits everything, and badly.
     for which, covariance, distance, share in (
-        (held, narrow, squared, 1.0 - config.slip_share),
-        (slipped, wide, squared_wide, config.slip_share),
+        (held, narrow, squared, 1.0 - config.slip_probability),
+        (slipped, wide, squared_wide, config.slip_probability),
     ):
         if which.any():
             narrower = np.minimum(0.5 * (peak[None] - np.log(_determinant(covariance))), 0.0)
@@ -572,7 +574,7 @@ def _corrected(
     rows = mixture.take(h)
     observation, noise, innovation = fit.observation[i], fit.noise[i], fit.innovation[h, i]
     prior = rows.covariance.copy()
-    slip = np.array([config.slip_m**2, config.slip_m**2, (0.1 * config.slip_m) ** 2])
+    slip = np.array([config.slip_std_m**2, config.slip_std_m**2, (0.1 * config.slip_std_m) ** 2])
     prior[:, range(3), range(3)] += fit.slipped[h, i][:, None] * slip
     cross = prior @ observation.transpose(0, 2, 1)
     gain = np.linalg.solve(observation @ cross + noise, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
@@ -626,7 +628,7 @@ def _moved(mixture: _Mixture, motion: Motion, config: FusionConfig) -> _Mixture:
     mean[:, :2] += shrink[:, None] * way
     mean[:, 2] = _wrap(mean[:, 2] + motion.delta[2] + length * mean[:, 7])
     # Errors that last change along the way, and keep their size.
-    kept = np.exp(-length / np.array([config.error_m] * 3 + [_ODOMETRY_M] * 2))
+    kept = np.exp(-length / np.array([config.measurement_correlation_m] * 3 + [_ODOMETRY_M] * 2))
     lasting = _lasting(config)
     mean[:, 3:] *= kept
     step[:, range(3, _STATE), range(3, _STATE)] *= kept
@@ -687,7 +689,7 @@ def _born(
     joint[:, range(3, _STATE), range(3, _STATE)] = _lasting(config)
     if log_likelihood is not None:
         # The pose is off by what the alignment is off, with the other sign.
-        root = math.sqrt(config.error_share) * _root(covariance)
+        root = math.sqrt(config.measurement_error_correlation) * _root(covariance)
         joint[:, :3, 3:6], joint[:, 3:6, :3] = -root, -root
     return _Mixture(
         mean=np.column_stack([grid[:, :2], heading_rad, np.zeros((n, _STATE - 3))]),
@@ -705,8 +707,8 @@ def _born(
 
 def _lasting(config: FusionConfig) -> Float64Array:
     """Return the variances (5,) of the errors that last, as they are where nothing is known of them."""
-    turn = math.radians(config.odometry_turn_deg_per_m)
-    return np.array([1.0, 1.0, 1.0, config.odometry_error**2, turn**2])
+    turn = math.radians(config.odometry_drift_deg_per_m)
+    return np.array([1.0, 1.0, 1.0, config.odometry_relative_std**2, turn**2])
 
 
 def _empty(config: FusionConfig) -> _Mixture:
@@ -756,7 +758,7 @@ def _estimate(
     middle = shares @ off[near]
     rest = off[near] - middle
     covariance = np.einsum("b,bij->ij", shares, mixture.covariance[near, :3, :3]) + (rest * shares[:, None]).T @ rest
-    lasting = (config.map_error_m, config.map_error_m, math.radians(config.map_turn_deg))
+    lasting = (config.map_std_m, config.map_std_m, math.radians(config.map_std_deg))
     covariance += np.diag(np.square(lasting))
     pose = mixture.mean[leader, :3] + middle
     grid = np.array([pose[0], pose[1], float(shares @ mixture.height[near])])
@@ -768,10 +770,10 @@ def _odometry_fault(
 ) -> str:
     """Say what is wrong with the odometry, as a clause that follows a sentence; empty where nothing is."""
     scale, turn_deg = float(mixture.mean[leader, 6]), math.degrees(mixture.mean[leader, 7])
-    if abs(scale) > 3.0 * config.odometry_error:
+    if abs(scale) > 3.0 * config.odometry_relative_std:
         kind = "short" if scale > 0.0 else "long"
         return f"; the odometry's ways are {abs(scale) / (1.0 + scale):.0%} too {kind}"
-    if abs(turn_deg) > 3.0 * config.odometry_turn_deg_per_m:
+    if abs(turn_deg) > 3.0 * config.odometry_drift_deg_per_m:
         return f"; the odometry turns {-turn_deg:+.1f} degrees a metre that the robot does not"
     if len(trail) == _TRAIL:
         moved_m, told_m = float(np.hypot(*(trail[-1][1] - trail[0][1]))), trail[-1][0] - trail[0][0]

@@ -32,7 +32,7 @@ def encode_query(encoder: DescriptorEncoder, points: Float32Array) -> Float32Arr
     One of each heading that the robot may have, where the encoder knows headings: submaps look north. One alone,
     averaged over the encoder's turns, where it does not.
     """
-    headings, turns = (encoder.headings, encoder.turns) if isinstance(encoder, HeadingEncoder) else (1, 1)
+    headings, turns = (encoder.headings, encoder.rotations) if isinstance(encoder, HeadingEncoder) else (1, 1)
     if headings * turns == 1:
         return encoder.encode(points)[None]
     count = headings if headings > 1 else turns

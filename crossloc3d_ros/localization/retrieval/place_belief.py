@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp, softmax
 
-from crossloc3d_ros.config import CalibrationConfig, CredibilityConfig
+from crossloc3d_ros.config import CalibrationConfig, RetrievalConfig
 from crossloc3d_ros.types import (
     BoolArray,
     CalibratedEncoder,
@@ -45,14 +45,14 @@ class Belief:
     """(k,) which candidates belong to the place."""
 
 
-def effective_calibration(config: CredibilityConfig, encoder: DescriptorEncoder) -> CalibrationConfig:
+def effective_calibration(config: RetrievalConfig, encoder: DescriptorEncoder) -> CalibrationConfig:
     """Return the calibration that comes with the encoder's weights, as far as `config` does not override it."""
     stored = encoder.calibration if isinstance(encoder, CalibratedEncoder) else None
     base = stored if stored is not None else CalibrationConfig()
     return CalibrationConfig(
         temperature=config.temperature or base.temperature,
-        none_distance=config.none_distance or base.none_distance,
-        none_scale=config.none_scale or base.none_scale,
+        null_distance=config.null_distance or base.null_distance,
+        null_scale=config.null_scale or base.null_scale,
     )
 
 
@@ -64,12 +64,12 @@ def candidate_probabilities(distances: Float32Array, calibration: CalibrationCon
     if len(distances) == 0:
         return np.empty(0)
     distances_64 = np.asarray(distances, dtype=np.float64)
-    some = expit((calibration.none_distance - distances_64.min()) / calibration.none_scale)
+    some = expit((calibration.null_distance - distances_64.min()) / calibration.null_scale)
     with np.errstate(invalid="ignore"):  # infinitely far from everything: no number, and so no fix
         return np.asarray(some * softmax(-distances_64 / calibration.temperature))
 
 
-def judge(candidates: Candidates, enu: Float64Array, config: CredibilityConfig) -> Belief:
+def judge(candidates: Candidates, enu: Float64Array, config: RetrievalConfig) -> Belief:
     """Find the place in which most of the belief lies, and say whether it is enough for a fix.
 
     `enu` (k, 3) holds the candidates' positions in the map frame; k must be at least 1. The place is the group of
@@ -80,7 +80,7 @@ def judge(candidates: Candidates, enu: Float64Array, config: CredibilityConfig) 
     members = _heaviest_group(enu, probabilities, config.cluster_radius_m)
     probability = float(probabilities[members].sum())
     mean, covariance = _weighted_moments(enu[members], probabilities[members])
-    covariance += np.diag([config.position_floor_m**2, config.position_floor_m**2, config.height_floor_m**2])
+    covariance += np.diag([config.min_std_m**2, config.min_std_m**2, config.min_height_std_m**2])
     # Written so that a belief that is not a number gives no fix.
     is_fix = probability >= config.min_probability
     return Belief(
@@ -114,7 +114,7 @@ def calibrate(
     best = near.min(axis=1)
     found = right.any(axis=1)
     scale = float(np.std(best)) or 1.0
-    initial = start or CalibrationConfig(temperature=scale, none_distance=float(np.median(best)), none_scale=scale)
+    initial = start or CalibrationConfig(temperature=scale, null_distance=float(np.median(best)), null_scale=scale)
     near_found, right_near = near[found], np.where(right, near, np.inf)[found]
 
     def presence_loss(x: Float64Array) -> float:
@@ -127,11 +127,11 @@ def calibrate(
         losses = logsumexp(-beta * near_found, axis=1) - logsumexp(-beta * right_near, axis=1)
         return float(np.sum(losses) + 1e-2 * (x[0] - np.log(scale)) ** 2)
 
-    presence = minimize(presence_loss, [initial.none_distance, np.log(initial.none_scale)], method="Nelder-Mead").x
+    presence = minimize(presence_loss, [initial.null_distance, np.log(initial.null_scale)], method="Nelder-Mead").x
     choice = minimize(choice_loss, [np.log(initial.temperature)], method="Nelder-Mead").x
     # Where the scans on the map look no more familiar than those outside, the best threshold may lie below zero.
-    none_distance = max(float(presence[0]), _LEAST_DISTANCE)
-    return CalibrationConfig(float(np.exp(choice[0])), none_distance, float(np.exp(presence[1])))
+    null_distance = max(float(presence[0]), _LEAST_DISTANCE)
+    return CalibrationConfig(float(np.exp(choice[0])), null_distance, float(np.exp(presence[1])))
 
 
 def _heaviest_group(enu: Float64Array, probabilities: Float64Array, radius_m: float) -> BoolArray:

@@ -299,10 +299,10 @@ def test_a_plan_without_anything_to_do_is_refused() -> None:
 
 def test_a_query_is_tried_as_the_localizer_tries_it() -> None:
     class Knows(Oracle):
-        headings, turns = 8, 1
+        headings, rotations = 8, 1
 
     class Averages(Oracle):
-        headings, turns = 1, 4
+        headings, rotations = 1, 4
 
     assert way_of(Oracle()) == (1, "nearest")
     assert way_of(Knows()) == (8, "nearest")

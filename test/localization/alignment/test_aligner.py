@@ -282,12 +282,12 @@ def test_the_prior_is_the_share_of_a_place_in_the_map(box_map: AerialMap) -> Non
 
 @pytest.mark.parametrize(
     ("search", "limit_km2", "everywhere"),
-    [("auto", 1.0, True), ("auto", 0.05, False), ("retrieval", 1.0, False), ("exhaustive", 0.0, True)],
+    [("auto", 1.0, True), ("auto", 0.05, False), ("candidates", 1.0, False), ("map", 0.0, True)],
 )
 def test_small_maps_are_searched_as_a_whole_if_wanted(
     box_map: AerialMap, search: Any, limit_km2: float, everywhere: bool
 ) -> None:
-    aligner = Aligner(box_map, AlignmentConfig(search=search, exhaustive_km2=limit_km2))
+    aligner = Aligner(box_map, AlignmentConfig(scope=search, map_max_km2=limit_km2))
     assert aligner.searches_everywhere is everywhere
     aligner.warm_up()
     assert bool(aligner.likelihood._filled.all()) is everywhere

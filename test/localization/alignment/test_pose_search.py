@@ -11,7 +11,7 @@ import pytest
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.localization.alignment import aligner as alignment
-from crossloc3d_ros.localization.alignment.aligner import observation_model
+from crossloc3d_ros.localization.alignment import observation_model
 from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evidence, evidence_of
 from crossloc3d_ros.localization.alignment.likelihood import QUANTA, Level, MapLikelihood
 from crossloc3d_ros.localization.alignment.observation_model import ObservationModel

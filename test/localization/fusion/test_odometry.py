@@ -90,7 +90,7 @@ def test_the_covariance_grows_with_the_way_and_not_with_the_distance_alone() -> 
     around = buffer.motion(0, turn_ns)
     np.testing.assert_allclose(around.delta[:2], 0.0, atol=0.01)
     length = 2.0 * turn_ns * 1e-9
-    assert math.sqrt(around.covariance[0, 0]) == pytest.approx(CONFIG.odometry_error * length, rel=0.01)
+    assert math.sqrt(around.covariance[0, 0]) == pytest.approx(CONFIG.odometry_relative_std * length, rel=0.01)
     still = buffer.motion(SECOND, SECOND)
     assert 0 < still.covariance[0, 0] < 0.02**2, "no motion is free of error"
     np.testing.assert_allclose(still.delta, 0, atol=1e-12)

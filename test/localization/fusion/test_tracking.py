@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 
 # As the worlds below are, which need not be as the defaults are.
 CONFIG = FusionConfig(
-    evidence_m=20.0, confirm_m=3.0, error_scale=1.0, error_share=0.8, error_m=5.0, position_floor_m=0.1,
-    heading_floor_deg=0.2,
+    novelty_m=20.0, confirm_m=3.0, measurement_std_scale=1.0, measurement_error_correlation=0.8,
+    measurement_correlation_m=5.0, measurement_min_std_m=0.1, measurement_min_std_deg=0.2,
 )  # fmt: skip
 SECOND = 1_000_000_000
 AHEAD = np.array([1.0, 0.0, 0.0])
@@ -62,7 +62,7 @@ class World:
     def __init__(self, seed: int, *, places: int = 400, level: float = 14.0, twins: Sequence[Array] = ()) -> None:
         self.rng = np.random.default_rng(seed)
         self.places, self.level, self.twins, self.on_map, self.found = places, level, len(twins), True, 0.9
-        self.error_share, self.error_m = CONFIG.error_share, CONFIG.error_m
+        self.correlation, self.error_m = CONFIG.measurement_error_correlation, CONFIG.measurement_correlation_m
         self.way_m, self.common = 0.0, self.rng.standard_normal(3)
         self.carry_away()
         for row, offset in enumerate(twins, 1):
@@ -115,7 +115,7 @@ class World:
                 rows.append(self.places)
                 poses.append(self.rng.multivariate_normal(at, looked_at.covariance[h]))
                 level.append(-self.level + math.sqrt(2 * self.level) * self.rng.standard_normal())
-        share = self.error_share
+        share = self.correlation
         error = STD * (math.sqrt(share) * self.common + math.sqrt(1 - share) * self.rng.standard_normal(3))
         stack = np.array(poses).reshape(-1, 3)
         stack[np.array(rows, dtype=np.int64) < fitting] += error
@@ -199,7 +199,7 @@ def test_a_robot_that_has_seen_nothing_believes_nothing() -> None:
 
 @given(st.lists(st.floats(-20, 20), min_size=1, max_size=9))
 def test_after_one_scan_the_belief_is_that_of_the_scan_alone(levels: list[float]) -> None:
-    config = FusionConfig(blind_share=1e-6, evidence_limit=1000.0)
+    config = FusionConfig(clutter_probability=1e-6, max_log_likelihood=1000.0)
     aligned = aligned_at([(100.0 * i, 0, 0) for i in range(len(levels))], levels)
     tracker = Tracker(config)
     tracker.predict(0, None)
@@ -221,7 +221,7 @@ def test_a_pose_found_twice_counts_once() -> None:
 
 
 def test_however_well_a_scan_fits_it_is_no_proof_but_tells_places_apart() -> None:
-    tracker = Tracker(FusionConfig(evidence_limit=12.0))
+    tracker = Tracker(FusionConfig(max_log_likelihood=12.0))
     tracker.predict(0, None)
     belief = tracker.update(aligned_at([(0, 0, 0), (200, 0, 0)], [80.0, 77.0]))
     none = 1 - belief.hypotheses.probabilities.sum()
@@ -270,7 +270,7 @@ def test_evidence_grows_with_the_way() -> None:
 def test_the_way_counts_and_not_the_number_of_scans_on_it() -> None:
     beliefs = []
     for scans in (10, 200):
-        config = dataclasses.replace(CONFIG, odometry_error=1e-3, odometry_turn_deg_per_m=0.0)
+        config = dataclasses.replace(CONFIG, odometry_relative_std=1e-3, odometry_drift_deg_per_m=0.0)
         tracker, delta = Tracker(config), np.array([30.0 / scans, 0, 0])
         for k in range(scans + 1):
             tracker.predict(k * 30 * SECOND // scans, Motion(delta, motion_covariance(delta[0], 0, config)))
@@ -285,11 +285,17 @@ def test_the_way_counts_and_not_the_number_of_scans_on_it() -> None:
 def test_position_and_variance_are_those_of_least_squares_over_all_scans() -> None:
     """Oracle: the batch solution with the full covariance of errors that are alike over some metres."""
     config = dataclasses.replace(
-        CONFIG, odometry_error=1e-4, odometry_turn_deg_per_m=1e-6, map_error_m=0.0, error_share=0.7
+        CONFIG,
+        odometry_relative_std=1e-4,
+        odometry_drift_deg_per_m=1e-6,
+        map_std_m=0.0,
+        measurement_error_correlation=0.7,
     )
     rng = np.random.default_rng(3)
     n, step_m, noise = 12, 2.0, 0.1
-    common = 0.7 * np.exp(-step_m * np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / config.error_m)
+    common = 0.7 * np.exp(
+        -step_m * np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / config.measurement_correlation_m
+    )
     errors = STD[0] ** 2 * (common + 0.3 * np.eye(n))
     z = step_m * np.arange(n) + rng.multivariate_normal(np.zeros(n), errors)
     tracker = Tracker(config)
@@ -311,7 +317,7 @@ def test_a_motion_in_an_uncertain_heading_has_the_moments_of_its_samples(
     std: float, heading: float, forward: float, turn: float
 ) -> None:
     rng = np.random.default_rng(0)
-    tracker = Tracker(dataclasses.replace(CONFIG, odometry_error=1e-4, odometry_turn_deg_per_m=0.0))
+    tracker = Tracker(dataclasses.replace(CONFIG, odometry_relative_std=1e-4, odometry_drift_deg_per_m=0.0))
     prior = np.array([[0.5, 0.1, 0.1 * std], [0.1, 0.3, 0.0], [0.1 * std, 0.0, std**2]])
     tracker.set_prior(PosePrior(np.array([10.0, 20.0, 0.0]), heading, prior, 0))
     tracker.predict(0, None)
@@ -350,7 +356,7 @@ def test_turning_and_moving_the_world_turns_and_moves_the_estimate() -> None:
 
 
 def test_it_finds_itself_and_knows_how_well() -> None:
-    config = dataclasses.replace(CONFIG, map_error_m=0.1)  # the map of these worlds has no errors of its own
+    config = dataclasses.replace(CONFIG, map_std_m=0.1)  # the map of these worlds has no errors of its own
     steps = [step for seed in range(6) for step in travel(World(seed), Tracker(config), 60)]
     found = [min(s.way_m for s in fixes(steps[60 * i : 60 * i + 60])) for i in range(6)]
     assert np.median(found) < 20
@@ -365,12 +371,12 @@ def test_it_finds_itself_and_knows_how_well() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("error_share", "error_m"), [(0.8, 5.0), (0.0, 5.0), (0.8, 15.0)])
-def test_the_covariance_holds_where_errors_are_of_another_kind_than_thought(error_share: float, error_m: float) -> None:
+@pytest.mark.parametrize(("correlation", "error_m"), [(0.8, 5.0), (0.0, 5.0), (0.8, 15.0)])
+def test_the_covariance_holds_where_errors_are_of_another_kind_than_thought(correlation: float, error_m: float) -> None:
     steps = []
     for seed in range(12):
         world = World(100 + seed, level=20.0)
-        world.error_share, world.error_m = error_share, error_m
+        world.correlation, world.error_m = correlation, error_m
         steps += fixes(travel(world, Tracker(CONFIG), 100))
     inside = np.array([np.abs(step.error[:2]) < 2 * np.sqrt(np.diag(step.belief.covariance)[:2]) for step in steps])
     # Errors that change faster than thought average out faster, too: then it is cautious, but not beyond all measure.
@@ -400,7 +406,7 @@ def test_a_place_that_the_search_missed_at_first_is_granted_what_it_would_have_t
         here, missed = compose(here, AHEAD), compose(missed, AHEAD)
     # It fits as well since it was found: only that it was missed for 15 m speaks against it.
     odds = belief.hypotheses.probabilities[1] / belief.hypotheses.probabilities[0]
-    assert odds == pytest.approx((1 - CONFIG.found_share) ** (15 / CONFIG.evidence_m), rel=0.5)
+    assert odds == pytest.approx((1 - CONFIG.detection_probability) ** (15 / CONFIG.novelty_m), rel=0.5)
     assert not belief.is_fix
 
 

@@ -19,9 +19,9 @@ class Compass:
     fingerprint = "compass"
     descriptor_size = 3
 
-    def __init__(self, headings: int, turns: int = 1) -> None:
+    def __init__(self, headings: int, rotations: int = 1) -> None:
         self.headings = headings
-        self.turns = turns
+        self.rotations = rotations
 
     def encode(self, points: Float32Array) -> Float32Array:
         mean: Float32Array = points.mean(axis=0)
@@ -48,7 +48,7 @@ def test_encoder_without_headings_is_asked_once() -> None:
 
 def test_mean_over_turns_takes_the_heading_out() -> None:
     patch = _patch(np.random.default_rng(3))
-    encoder = Compass(1, turns=4)
+    encoder = Compass(1, rotations=4)
     first, second = (encode_query(encoder, turn(patch, angle)) for angle in (0.0, math.pi / 2))  # type: ignore[arg-type]
     np.testing.assert_allclose(first, second, atol=1e-6)
     np.testing.assert_allclose(first[0, :2], 0.0, atol=1e-6)

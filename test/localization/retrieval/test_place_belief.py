@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from crossloc3d_ros.config import CalibrationConfig, CredibilityConfig, from_dict, to_dict
+from crossloc3d_ros.config import CalibrationConfig, RetrievalConfig, from_dict, to_dict
 from crossloc3d_ros.localization.retrieval.place_belief import calibrate, candidate_probabilities, judge
 from crossloc3d_ros.types import Candidates, FixStatus
 
-CALIBRATION = CalibrationConfig(temperature=0.1, none_distance=1.0, none_scale=0.05)
-CONFIG = CredibilityConfig()
+CALIBRATION = CalibrationConfig(temperature=0.1, null_distance=1.0, null_scale=0.05)
+CONFIG = RetrievalConfig()
 Array = npt.NDArray[np.float64]
 
 
@@ -34,9 +34,9 @@ def places(*xy: tuple[float, float]) -> Array:
     st.floats(1e-3, 1e3),
 )
 def test_probabilities_are_probabilities_whatever_the_distances(
-    distances: npt.NDArray[np.float32], temperature: float, none_distance: float, none_scale: float
+    distances: npt.NDArray[np.float32], temperature: float, null_distance: float, null_scale: float
 ) -> None:
-    shares = candidate_probabilities(distances, CalibrationConfig(temperature, none_distance, none_scale))
+    shares = candidate_probabilities(distances, CalibrationConfig(temperature, null_distance, null_scale))
     assert (shares >= 0).all()
     assert shares.sum() <= 1 + 1e-9
     assert (np.diff(shares[np.argsort(distances, kind="stable")]) <= 1e-12).all(), "the nearer, the likelier"
@@ -94,9 +94,9 @@ def test_the_covariance_is_never_below_the_floor_and_never_beyond_the_cluster(en
     belief = judge(candidates_of(np.sort(distances), enu), enu, CONFIG)
     np.testing.assert_allclose(belief.covariance, belief.covariance.T, atol=1e-9)
     variances = np.linalg.eigvalsh(belief.covariance[:2, :2])
-    assert variances.min() >= CONFIG.position_floor_m**2 * (1 - 1e-9)
-    assert variances.max() <= CONFIG.position_floor_m**2 + CONFIG.cluster_radius_m**2 * (1 + 1e-9)
-    assert belief.covariance[2, 2] >= CONFIG.height_floor_m**2 * (1 - 1e-9)
+    assert variances.min() >= CONFIG.min_std_m**2 * (1 - 1e-9)
+    assert variances.max() <= CONFIG.min_std_m**2 + CONFIG.cluster_radius_m**2 * (1 + 1e-9)
+    assert belief.covariance[2, 2] >= CONFIG.min_height_std_m**2 * (1 - 1e-9)
 
 
 def test_the_order_of_equal_rows_does_not_matter() -> None:
@@ -126,10 +126,10 @@ def made_up_drive(rng: np.random.Generator, n: int, truth: CalibrationConfig) ->
 
 
 def test_calibration_finds_the_law_that_made_the_data() -> None:
-    truth = CalibrationConfig(temperature=0.12, none_distance=0.7, none_scale=0.08)
+    truth = CalibrationConfig(temperature=0.12, null_distance=0.7, null_scale=0.08)
     found = calibrate(*made_up_drive(np.random.default_rng(0), 4000, truth))
-    assert found.none_distance == pytest.approx(truth.none_distance, abs=0.03)
-    assert found.none_scale == pytest.approx(truth.none_scale, rel=0.25)
+    assert found.null_distance == pytest.approx(truth.null_distance, abs=0.03)
+    assert found.null_scale == pytest.approx(truth.null_scale, rel=0.25)
     assert found.temperature == pytest.approx(truth.temperature, rel=0.15)
 
 
@@ -150,7 +150,7 @@ def test_calibration_learns_nowhere_from_scans_outside_of_the_map() -> None:
     outside = [np.sort(rng.uniform(0.9, 1.2, 5)) for _ in range(50)]
     separations = [np.array([5.0, 900, 900, 900, 900])] * 50 + [np.full(5, np.inf)] * 50
     found = calibrate(inside + outside, separations)
-    assert 0.4 < found.none_distance < 0.9
+    assert 0.4 < found.null_distance < 0.9
     belief_inside = candidate_probabilities(inside[0].astype(np.float32), found).sum()
     belief_outside = candidate_probabilities(outside[0].astype(np.float32), found).sum()
     assert belief_inside > 0.9
