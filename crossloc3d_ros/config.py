@@ -272,9 +272,11 @@ class LocalizerNodeConfig(LocalizerConfig):
         low=1,
         high=100,
     )
+    stall_s: float = option(5.0, "a scan that takes longer is reported as an error", low=0.1, high=3600.0)
     autostart: bool = option(True, "configure and activate without being told by a lifecycle manager")
     global_frame_id: str = option("map", "name of the ENU frame at the map's origin")
     base_frame_id: str = option("base_link", "name of the frame whose position is given")
+    odom_frame_id: str = option("", "name of the odometry's frame; empty = as its messages name it")
     mounting_from_tf: bool = option(False, "take the lidar's pose on base_frame_id from TF, not from scan.mounting")
     use_imu: bool = option(False, "level the scan by the accelerations on topic imu (axes of base_frame_id)")
     imu_time_constant_s: float = option(1.0, "time constant of the low-pass on the accelerations", low=0.01, high=60.0)

@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def action() -> int:
         try:
-            from crossloc3d_ros.ros.localizer_node import run_localizer
+            from crossloc3d_ros.ros.process import run_localizer
         except ModuleNotFoundError as error:
             if (error.name or "").split(".")[0] not in ROS_PACKAGES:
                 raise

@@ -43,7 +43,7 @@ class Localizer:
         self.calibration = effective_calibration(config.retrieval, encoder)
         self._aligner = None if config.alignment.scope == "none" else Aligner(aerial_map, config.alignment)
         self._tracker = Tracker(config.fusion)
-        self._looks = Looks(config.alignment)
+        self._schedule = SearchSchedule(config.alignment)
 
     @property
     def stamp_ns(self) -> int | None:
@@ -86,7 +86,7 @@ class Localizer:
         aligned = moved(aligned, step)
         watch.lap("align_ms")
         belief = self._tracker.update(aligned)
-        self._looks.state = belief.state
+        self._schedule.state = belief.state
         watch.lap("fuse_ms")
         return posed_estimate(
             scan.stamp_ns,
@@ -104,10 +104,23 @@ class Localizer:
         """Take in what is known of the pose from outside: an operator's initial pose, a compass."""
         self._tracker.set_prior(prior)
 
+    def reconfigure(self, config: LocalizerConfig) -> None:
+        """Use other settings from the next scan on; the hypotheses and what was read of the map are kept."""
+        self.config = config
+        self.calibration = effective_calibration(config.retrieval, self.encoder)
+        self._tracker.reconfigure(config.fusion)
+        self._schedule.reconfigure(config.alignment)
+        if config.alignment.scope == "none":
+            self._aligner = None
+        elif self._aligner is None:
+            self._aligner = Aligner(self.aerial_map, config.alignment)
+        else:
+            self._aligner.reconfigure(config.alignment)
+
     def reset(self) -> None:
         """Forget every hypothesis: the robot may be anywhere."""
         self._tracker.reset()
-        self._looks.reset()
+        self._schedule.reset()
 
     def warm_up(self) -> None:
         """Run every step once, so that the first scan is as fast as the others.
@@ -141,18 +154,18 @@ class Localizer:
         hypotheses: Hypotheses,
     ) -> AlignedPoses:
         """Align at the hypotheses, and as often as is due around the candidates and everywhere."""
-        config, looks = self.config.alignment, self._looks
+        config, schedule = self.config.alignment, self._schedule
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
         alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
         if alignment is None:
             return no_aligned_poses()
         alignment.follow(hypotheses)
         if not self._tracker.skips:
-            if looks.around(stamp_ns) and config.scope != "map":
+            if schedule.around(stamp_ns) and config.scope != "map":
                 alignment.look_around()
             if aligner.searches_everywhere:
                 is_enough = config.scope == "auto" and alignment.is_convincing()
-                if not is_enough and looks.everywhere(stamp_ns):
+                if not is_enough and schedule.everywhere(stamp_ns):
                     alignment.look_everywhere()
         return alignment.result()
 
@@ -165,15 +178,19 @@ class Localizer:
         return np.asarray(motion.delta * (seconds / ((stamp_ns - since) * 1e-9)))
 
 
-class Looks:
-    """When to look beyond the hypotheses: at once where nothing is known, now and then afterwards."""
+class SearchSchedule:
+    """When to search beyond the hypotheses: at once where nothing is known, periodically afterwards."""
 
     def __init__(self, config: AlignmentConfig) -> None:
         self._config = config
         self.reset()
 
+    def reconfigure(self, config: AlignmentConfig) -> None:
+        """Use other periods from the next scan on."""
+        self._config = config
+
     def reset(self) -> None:
-        """Look at the next scan."""
+        """Search at the next scan."""
         self.state = TrackState.SEARCHING
         self._last_ns: dict[str, int] = {}
 

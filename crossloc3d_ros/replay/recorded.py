@@ -12,21 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.errors import BagError, CloudError, PoseError
-from crossloc3d_ros.evaluation.drives.estimates import (
-    EstimateWriter,
-)
+from crossloc3d_ros.evaluation.drives.estimates import EstimateWriter
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, stamp_ns_of
 from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
-from crossloc3d_ros.localization.fusion.gravity import GravityFilter
-from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
-from crossloc3d_ros.localization.localizer import Localizer, no_estimate
-from crossloc3d_ros.types import Estimate, Float64Array, Scan
+from crossloc3d_ros.localization.session import OdometryKind, Outcome, PreparedInput, ScanLocalizer, Session
+from crossloc3d_ros.types import Estimate
 
 log = logging.getLogger(__name__)
-
 
 Progress = Callable[[int, int, Estimate], None]
 """Scans done, scans to do, the newest estimate."""
@@ -34,7 +28,7 @@ Progress = Callable[[int, int, Estimate], None]
 
 @dataclass(frozen=True)
 class OdometrySource:
-    """What tells how the robot moved between two scans: a topic, or the scans themselves."""
+    """What measures the motion between two scans: a topic, or the scans themselves."""
 
     topic: str | None = None
     """nav_msgs/Odometry; None: from scan to scan, by KISS-ICP."""
@@ -49,7 +43,7 @@ HELD_NS = 500_000_000
 def localize_bag(
     bag: BagReader,
     topic: str,
-    localizer: Localizer,
+    localizer: ScanLocalizer,
     output: Path,
     *,
     every: int = 1,
@@ -60,129 +54,100 @@ def localize_bag(
 ) -> int:
     """Localize every `every`-th scan of a bag, write the estimates to the CSV file `output` and return their number.
 
-    `imu_topic` levels the scans by accelerations in the axes of the base; `odometry` tells how the robot moved between
-    them, None that nothing does. A cloud that cannot be used becomes a row without a fix that says why; a bag that
-    breaks off raises BagError when the rows before the break are written.
+    `imu_topic` levels the scans by accelerations in the axes of the base; `odometry` names what measures the motion
+    between them; None = nothing does. A cloud that cannot be used becomes a row without a fix that says why; a bag
+    that breaks off raises BagError when the rows before the break are written.
     """
     total = math.ceil(bag.topic(topic, POINT_CLOUD).count / every)
-    motions = None if odometry is None else _Motions(odometry, localizer)
+    kind: OdometryKind = "none" if odometry is None else "scan" if odometry.topic is None else "topic"
+    feed = _Feed(Session(localizer, kind, imu_time_constant_s), odometry)
+    odometry_topic = None if odometry is None else odometry.topic
     done = 0
     with EstimateWriter(output) as writer:
-        for moment in _moments(bag, topic, every, imu_topic, imu_time_constant_s, motions):
-            if isinstance(moment.scan, CloudError):
-                estimate = no_estimate(moment.stamp_ns, str(moment.scan))
-            else:
-                motion = None if motions is None else motions.between(localizer.stamp_ns, moment.stamp_ns)
-                try:
-                    estimate = localizer.localize(moment.scan, moment.up, motion=motion)
-                except CloudError as error:
-                    estimate = no_estimate(moment.stamp_ns, str(error))
-            writer.write(estimate)
+        for outcome in _outcomes(bag, topic, every, imu_topic, odometry_topic, feed):
+            writer.write(outcome.estimate)
             done += 1
             if progress is not None:
-                progress(done, max(total, done), estimate)
+                progress(done, max(total, done), outcome.estimate)
     if done == 0:
         raise BagError(f"topic '{topic}' of {bag.path} holds no message")
     return done
 
 
-class _Moment(NamedTuple):
-    """A scan to localize, or why it cannot be."""
+class _Waiting(NamedTuple):
+    """A cloud of the recording that waits for the odometry of its stamp."""
 
     stamp_ns: int
     recorded_ns: int
-    scan: Scan | CloudError
-    up: Float64Array | None
+    scan: PreparedInput | CloudError
+    """The error says why the cloud cannot be used."""
 
 
-class _Motions:
-    """How the robot moved between scans."""
+class _Feed:
+    """Feed a session with the messages of a recording, in the order in which they were recorded."""
 
-    def __init__(self, source: OdometrySource, localizer: Localizer) -> None:
-        self.topic = source.topic
-        self._base_frame_id = source.base_frame_id
-        self._T_base_lidar = mounting_matrix(localizer.config.scan.mounting)
-        self._max_range_m = localizer.config.scan.max_range_m
-        fusion = localizer.config.fusion
-        self._buffer = OdometryBuffer(fusion) if source.topic is not None else ScanOdometry(fusion, self._max_range_m)
+    def __init__(self, session: Session, odometry: OdometrySource | None) -> None:
+        self._session = session
+        self._source = odometry
         self._warned = False
+
+    def take_imu(self, message: Any, recorded_ns: int) -> None:
+        force = message.linear_acceleration
+        self._session.add_acceleration(stamp_ns_of(message, recorded_ns), np.array([force.x, force.y, force.z]))
 
     def take_odometry(self, message: Any, recorded_ns: int) -> None:
         """Take in a message of the odometry's topic; what is no pose is left out."""
-        assert isinstance(self._buffer, OdometryBuffer)
-        child = message.child_frame_id
-        if not self._warned and child not in ("", self._base_frame_id):
-            log.warning("'%s' tells the pose of '%s'; it is taken for '%s'", self.topic, child, self._base_frame_id)
+        assert self._source is not None
+        child, base = message.child_frame_id, self._source.base_frame_id
+        if not self._warned and child not in ("", base):
+            log.warning("'%s' gives the pose of '%s'; it is taken for '%s'", self._source.topic, child, base)
             self._warned = True
         try:
-            self._buffer.add(stamp_ns_of(message, recorded_ns), pose_matrix(message.pose.pose))
+            self._session.add_odometry(stamp_ns_of(message, recorded_ns), pose_matrix(message.pose.pose))
         except PoseError as error:
             log.debug("odometry left out: %s", error)
 
-    def take_scan(self, scan: Scan) -> None:
-        """Take in a scan, where the scans themselves are the odometry."""
-        if isinstance(self._buffer, ScanOdometry):
-            points = scan.points[np.isfinite(scan.points).all(axis=1)].astype(np.float64)
-            points = points[np.linalg.norm(points, axis=1) <= self._max_range_m]
-            R, t = self._T_base_lidar[:3, :3], self._T_base_lidar[:3, 3]
-            self._buffer.add(scan.stamp_ns, points @ R.T + t)
+    def take_cloud(self, message: Any, recorded_ns: int) -> _Waiting:
+        stamp_ns = stamp_ns_of(message, recorded_ns)
+        try:
+            scan = replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns)
+            return _Waiting(stamp_ns, recorded_ns, self._session.receive(scan))
+        except CloudError as error:
+            return _Waiting(stamp_ns, recorded_ns, error)
 
-    def tells(self, moment: _Moment, now_ns: int) -> bool:
-        """Say whether all odometry that a scan needs has been read, or as much as will come."""
-        if not isinstance(self._buffer, OdometryBuffer):
-            return True
-        newest_ns = self._buffer.newest_ns
-        return now_ns - moment.recorded_ns > HELD_NS or (newest_ns is not None and newest_ns >= moment.stamp_ns)
+    def is_ready(self, waiting: _Waiting, now_ns: int) -> bool:
+        """Return whether all odometry that a scan needs has been read, or as much as will come."""
+        return now_ns - waiting.recorded_ns > HELD_NS or self._session.has_odometry_until(waiting.stamp_ns)
 
-    def between(self, from_ns: int | None, to_ns: int) -> Motion | None:
-        """Return the motion between the stamps of two scans; None where there is no first one."""
-        return None if from_ns is None else self._buffer.motion(from_ns, to_ns)
+    def localize(self, waiting: _Waiting) -> Outcome:
+        if isinstance(waiting.scan, CloudError):
+            return self._session.fault(waiting.stamp_ns, str(waiting.scan))
+        return self._session.localize(waiting.scan)
 
 
-def _moments(
-    bag: BagReader,
-    topic: str,
-    every: int,
-    imu_topic: str | None,
-    imu_time_constant_s: float,
-    motions: _Motions | None,
-) -> Iterator[_Moment]:
-    """Yield the scans of a bag in their order; each waits until the odometry of its stamp has been read."""
-    gravity = GravityFilter(imu_time_constant_s)
+def _outcomes(
+    bag: BagReader, topic: str, every: int, imu_topic: str | None, odometry_topic: str | None, feed: _Feed
+) -> Iterator[Outcome]:
+    """Yield the outcomes of every `every`-th scan of a bag in their order."""
     imu = None if imu_topic is None else bag.topic(imu_topic, IMU).name
-    odometry = None if motions is None or motions.topic is None else bag.topic(motions.topic, ODOMETRY).name
-    waiting: deque[_Moment] = deque()
+    odometry = None if odometry_topic is None else bag.topic(odometry_topic, ODOMETRY).name
+    waiting: deque[_Waiting] = deque()
     seen = 0
     topics = [name for name in (topic, imu, odometry) if name is not None]
     try:
         for name, recorded_ns, message in bag.messages(topics):
             if name == imu:
-                acceleration = message.linear_acceleration
-                gravity.update(
-                    stamp_ns_of(message, recorded_ns), np.array([acceleration.x, acceleration.y, acceleration.z])
-                )
-            elif name == odometry and motions is not None:
-                motions.take_odometry(message, recorded_ns)
+                feed.take_imu(message, recorded_ns)
+            elif name == odometry:
+                feed.take_odometry(message, recorded_ns)
             else:
+                cloud = feed.take_cloud(message, recorded_ns)
+                if seen % every == 0:
+                    waiting.append(cloud)
                 seen += 1
-                stamp_ns = stamp_ns_of(message, recorded_ns)
-                is_used = (seen - 1) % every == 0
-                if is_used or (motions is not None and odometry is None):
-                    scan = _scan_of(message, stamp_ns)
-                    if motions is not None and isinstance(scan, Scan):
-                        motions.take_scan(scan)
-                    if is_used:
-                        waiting.append(_Moment(stamp_ns, recorded_ns, scan, gravity.up(stamp_ns)))
-            while waiting and (motions is None or motions.tells(waiting[0], recorded_ns)):
-                yield waiting.popleft()
+            while waiting and feed.is_ready(waiting[0], recorded_ns):
+                yield feed.localize(waiting.popleft())
     except BagError:
-        yield from waiting  # what was read before the damage is whole
+        yield from map(feed.localize, waiting)  # what was read before the damage is whole
         raise
-    yield from waiting
-
-
-def _scan_of(message: Any, stamp_ns: int) -> Scan | CloudError:
-    try:
-        return replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns)
-    except CloudError as error:
-        return error
+    yield from map(feed.localize, waiting)

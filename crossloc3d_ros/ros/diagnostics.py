@@ -11,23 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from crossloc3d_ros.localization.session import Outcome
 from crossloc3d_ros.ros.conversions import stamp_message, state_values
-from crossloc3d_ros.types import Estimate, FixStatus
+from crossloc3d_ros.ros.worker import WorkerHealth
+from crossloc3d_ros.types import FixStatus
 
 WINDOW = 300
 """Latencies are those of so many last scans: half a minute at 10 Hz."""
 SILENCE_S = 3.0
 LOST_SHARE, LOST_TOLERATED = 0.05, 10
 """More lost than this is no hiccup: clouds do not fit into the publisher's shared memory, or the network is slow."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of one message."""
-
-    estimate: Estimate
-    is_fault: bool
-    """The message, not the place, was at fault: it could not be read or localizing it failed."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +96,15 @@ class Statistics:
                 silent_s=time.monotonic() - self._heard_at,
                 last=self._last,
             )
+
+
+def worker_complaint(health: WorkerHealth, stall_s: float) -> str:
+    """Return what is wrong with the thread that localizes, or an empty text: it has ended, or one task does not end."""
+    if not health.is_alive:
+        return f"the thread that localizes has ended ({health.failure or 'no reason known'}): restart the node"
+    if health.busy_s > stall_s:
+        return f"the scan at work has taken {health.busy_s:.0f} s and does not end: restart the node"
+    return ""
 
 
 def judge_health(

@@ -1,123 +1,134 @@
-"""Odometry between the subscription that hears it and the worker that asks how the robot has moved."""
+"""The topic odom: poses of the base from the subscription to the thread that localizes."""
 
 from __future__ import annotations
 
-import bisect
-import threading
+import queue
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from scipy.spatial.transform import Rotation, Slerp
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from crossloc3d_ros.errors import CrossLocError, PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
-from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer
 from crossloc3d_ros.ros.poses import stamp_of
+from crossloc3d_ros.ros.subscriptions import REPEAT_REASON_S, subscribe
 from crossloc3d_ros.types import Float64Array
 
 SILENCE_S = 1.0
-"""A source that has been silent for so long is not waited for, and is told of."""
-_KEPT = 2000
-"""Whole poses kept: ten seconds at 200 Hz, far more than a scan takes."""
+"""A source that has been silent for so long is not waited for, and is reported."""
+QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Receives from reliable publishers too; deep, because a second of 200 Hz may wait while this process has no time."""
+
+
+class OdometrySample(NamedTuple):
+    """One pose of the base."""
+
+    stamp_ns: int
+    T_odom_base: Float64Array
+    """(4, 4)"""
+    odom_frame_id: str
 
 
 @dataclass(frozen=True)
 class OdometryState:
-    """How odometry fares at one moment."""
+    """What has been received until now."""
 
     messages: int
+    """Those that could be used."""
     silent_s: float
-    """Since the last message, or since the start."""
+    """Since the last of them, or since the start."""
     complaint: str
     """Why the last message could not be used, or empty."""
 
 
 class OdometryInput:
-    """Take in messages in one thread, answer in another; a scan may come before the odometry of its stamp."""
+    """Receive messages in the executor's thread; hand their poses over to the thread that localizes."""
 
     def __init__(
         self,
-        buffer: OdometryBuffer,
         base_frame_id: str,
-        wait_s: float,
+        odom_frame_id: str,
+        timeout_s: float,
         pose_on_base: Callable[[str], Float64Array] | None = None,
     ) -> None:
-        """Fill `buffer`; `pose_on_base(frame)` gives `T_base_frame` where TF is at hand."""
-        self._buffer = buffer
+        """Take poses of `base_frame_id` in `odom_frame_id` (empty: whichever the messages name).
+
+        A scan waits up to `timeout_s` for the odometry of its stamp. `pose_on_base(frame)` gives `T_base_frame` (4, 4)
+        where TF is used.
+        """
         self._base_frame_id = base_frame_id
-        self._wait_s = wait_s
+        self._odom_frame_id = odom_frame_id
+        self._timeout_s = timeout_s
         self._pose_on_base = pose_on_base
-        self._heard = threading.Condition()
+        self._samples: queue.SimpleQueue[OdometrySample] = queue.SimpleQueue()
         self._messages = 0
-        self._poses: deque[tuple[int, Float64Array]] = deque(maxlen=_KEPT)
         self._heard_at = time.monotonic()
         self._complaint = ""
-        self.frame_id = ""
-        """Of the odometry, as its last message names it."""
+
+    def subscribe(self, node: Node) -> list[object]:
+        """Subscribe to odom; return the subscription."""
+
+        def receive(message: Odometry) -> None:
+            try:
+                self.take(message)
+            except CrossLocError as error:
+                node.get_logger().warning(f"odometry is not used: {error}", throttle_duration_sec=REPEAT_REASON_S)
+
+        return [subscribe(node, Odometry, "odom", receive, QOS)]
+
+    # In the executor's thread
 
     def take(self, message: Odometry) -> None:
         """Take in a message; PoseError where it cannot be used."""
         try:
-            T_odom_base = self._base_pose(message)
+            sample = OdometrySample(stamp_of(message), self._base_pose(message), message.header.frame_id)
         except CrossLocError as error:
-            with self._heard:
-                self._complaint = str(error)
+            self._complaint = str(error)
             raise
-        stamp_ns = stamp_of(message)
-        with self._heard:
-            if self._buffer.add(stamp_ns, T_odom_base):
-                if self._poses and stamp_ns <= self._poses[-1][0]:
-                    self._poses.clear()  # a recording that begins again
-                self._poses.append((stamp_ns, T_odom_base))
-            self.frame_id = message.header.frame_id
-            self._messages += 1
-            self._heard_at = time.monotonic()
-            self._complaint = ""
-            self._heard.notify_all()
-
-    def motion(self, from_ns: int, to_ns: int) -> Motion:
-        """Return how the robot moved between two stamps, after waiting a little for what is still on its way."""
-        deadline = time.monotonic() + self._wait_s
-        with self._heard:
-            while (self._buffer.newest_ns or 0) < to_ns and time.monotonic() - self._heard_at < SILENCE_S:
-                remaining_s = deadline - time.monotonic()
-                if remaining_s <= 0.0 or not self._heard.wait(remaining_s):
-                    break
-            return self._buffer.motion(from_ns, to_ns)
-
-    def pose_at(self, stamp_ns: int) -> Float64Array | None:
-        """Return `T_odom_base` (4, 4) at a stamp between two samples, None where odometry does not tell it."""
-        with self._heard:
-            poses = list(self._poses)
-        after = bisect.bisect_left(poses, stamp_ns, key=lambda pose: pose[0])
-        if after == len(poses):
-            return None
-        (end_ns, T_end) = poses[after]
-        if end_ns == stamp_ns:
-            return T_end
-        if after == 0:
-            return None
-        (begin_ns, T_begin) = poses[after - 1]
-        if not self._buffer.motion(begin_ns, end_ns).is_known:
-            return None
-        share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
-        T = np.eye(4)
-        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix([T_begin[:3, :3], T_end[:3, :3]]))(share).as_matrix()
-        T[:3, 3] = T_begin[:3, 3] + share * (T_end[:3, 3] - T_begin[:3, 3])
-        return T
+        self._complaint = ""
+        self._messages += 1
+        self._heard_at = time.monotonic()
+        self._samples.put(sample)
 
     def state(self) -> OdometryState:
-        """Return how it fares."""
-        with self._heard:
-            return OdometryState(self._messages, time.monotonic() - self._heard_at, self._complaint)
+        """Return what has been received until now."""
+        return OdometryState(self._messages, time.monotonic() - self._heard_at, self._complaint)
+
+    # In the thread that localizes
+
+    def drain(self) -> list[OdometrySample]:
+        """Return the samples that have arrived since the last call, in their order."""
+        samples = []
+        while True:
+            try:
+                samples.append(self._samples.get_nowait())
+            except queue.Empty:
+                return samples
+
+    def wait(self, add: Callable[[OdometrySample], bool]) -> None:
+        """Hand samples to `add` as they arrive until it returns True, the timeout ends or odometry is silent."""
+        deadline = time.monotonic() + self._timeout_s
+        while time.monotonic() - self._heard_at < SILENCE_S:
+            try:
+                sample = self._samples.get(timeout=max(deadline - time.monotonic(), 0.0))
+            except queue.Empty:
+                return
+            if add(sample):
+                return
 
     def _base_pose(self, message: Odometry) -> Float64Array:
+        frame, child = message.header.frame_id, message.child_frame_id
+        if self._odom_frame_id not in ("", frame):
+            raise PoseError(
+                f"it is given in '{frame}', not in '{self._odom_frame_id}': set odom_frame_id to '{frame}', or to '' "
+                "where any frame will do"
+            )
         T_odom_child = pose_matrix(message.pose.pose)
-        child = message.child_frame_id
         if child in ("", self._base_frame_id):
             return T_odom_child
         if self._pose_on_base is None:

@@ -127,8 +127,9 @@ class ConfigParameters(Generic[T]):
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         # Called for declarations too, of parameters that nobody knows yet.
         try:
-            for parameter in parameters:
-                self._admit(parameter)
+            new = {parameter.name: parameter.value for parameter in map(self._admit, parameters)}
+            values = {name: _plain(new[name]) if name in new else self._value(name) for name in self._settings}
+            from_dict(self._kind, _nested(values))  # settings that contradict each other are refused together
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

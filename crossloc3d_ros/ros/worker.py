@@ -1,33 +1,62 @@
-"""A thread that works through items in their order, and never falls far behind.
+"""A thread that owns the localizer: everything that changes it passes through here, in the order of arrival.
 
-A few may wait, so that one that takes long costs none of the others. Where more come than are worked off, all that wait
-but the newest are given up: a machine slower than the sensor drops scans, and what it tells stays young.
+Scans may wait, so that one that takes long costs none of the others. Where more come than are worked off, all that wait
+but the newest are dropped: a machine slower than the sensor drops scans, and its output stays recent.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from dataclasses import dataclass
 
-T = TypeVar("T")
+from crossloc3d_ros.errors import ConfigError
+
+log = logging.getLogger(__name__)
+
+MAX_WAITING = 20_000
+"""Commands kept for a worker that hangs: a hundred seconds of an IMU at 200 Hz. Beyond, the oldest are dropped."""
+
+Task = Callable[[], object]
 
 
-class Worker(Generic[T]):
-    """Work on the items handed over, one at a time, in a thread of its own."""
+@dataclass(frozen=True)
+class WorkerHealth:
+    """What the worker's thread is doing at one moment."""
 
-    def __init__(self, work: Callable[[T], None], name: str, queue_depth: int = 1) -> None:
-        """Prepare a worker that calls `work`, which must not raise; nothing runs before `start`."""
-        self._work = work
+    is_alive: bool
+    """Whether the thread runs; True before the start."""
+    busy_s: float
+    """How long the task at work has taken so far; 0 where there is none."""
+    failure: str
+    """Why the thread has ended by itself; empty where it has not."""
+
+
+class Worker:
+    """Run tasks one at a time in a thread of its own: scans, of which some may be dropped, and commands."""
+
+    def __init__(self, name: str, queue_depth: int = 1) -> None:
+        """Prepare a worker on which at most `queue_depth` scans wait; nothing runs before `start`."""
         self._name = name
-        self._most_waiting = queue_depth
+        self._queue_depth = queue_depth
         self._changed = threading.Condition()
-        self._waiting: deque[T] = deque()
+        self._waiting: deque[tuple[Task, bool]] = deque()
+        """Tasks, and whether each is a scan."""
         self._thread: threading.Thread | None = None
+        self._abandoned: threading.Thread | None = None
+        self._busy_since: float | None = None
+        self._failure = ""
 
-    def start(self, prepare: Callable[[], None]) -> None:
-        """Start the thread, let it call `prepare` first, and wait for that; what `prepare` raises is raised here."""
+    def start(self, prepare: Task) -> None:
+        """Start the thread, let it run `prepare` first, and wait for that; what `prepare` raises is raised here.
+
+        ConfigError while a thread that `stop` gave up on still runs: two would work on the same localizer.
+        """
+        if self._abandoned is not None and self._abandoned.is_alive():
+            raise ConfigError("the scan at work when the node was deactivated does not end: clean the node up first")
         prepared = threading.Event()
         failures: list[BaseException] = []
 
@@ -49,26 +78,35 @@ class Worker(Generic[T]):
             self.stop()
             raise failures[0]
 
-    def offer(self, item: T) -> int:
-        """Hand over an item and return how many it pushed out that nobody had begun to work on."""
+    def offer(self, scan: Task) -> int:
+        """Hand over the work on a scan; return how many waiting scans were dropped for it."""
         with self._changed:
-            pushed_out = 0
-            if len(self._waiting) >= self._most_waiting:
-                pushed_out = len(self._waiting)
-                self._waiting.clear()
-            self._waiting.append(item)
-            self._changed.notify()
-        return pushed_out
+            waiting = sum(is_scan for _, is_scan in self._waiting)
+            dropped = waiting if waiting >= self._queue_depth else 0
+            if dropped:
+                self._drop_scans()
+            self._put(scan, is_scan=True)
+        return dropped
 
-    def discard(self) -> int:
-        """Forget the items that wait and return how many there were."""
+    def post(self, command: Task) -> None:
+        """Hand over a command: it runs after the scans that came before it, and is not dropped with them."""
         with self._changed:
-            waiting = len(self._waiting)
-            self._waiting.clear()
-        return waiting
+            self._put(command, is_scan=False)
+
+    def drop_scans(self) -> int:
+        """Drop the scans that wait and return how many there were."""
+        with self._changed:
+            return self._drop_scans()
+
+    def health(self) -> WorkerHealth:
+        """Return what the thread is doing."""
+        with self._changed:
+            thread, since = self._thread, self._busy_since
+            busy_s = 0.0 if since is None else time.monotonic() - since
+            return WorkerHealth(thread is None or thread.is_alive(), busy_s, self._failure)
 
     def stop(self, timeout_s: float = 3.0) -> bool:
-        """Let the item at work end, drop those that wait, and return whether the thread has ended."""
+        """Let the task at work end, drop those that wait, and return whether the thread has ended."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._waiting.clear()
@@ -76,7 +114,21 @@ class Worker(Generic[T]):
         if thread is None:
             return True
         thread.join(timeout_s)
+        self._abandoned = thread
         return not thread.is_alive()
+
+    def _put(self, task: Task, *, is_scan: bool) -> None:
+        if len(self._waiting) >= MAX_WAITING:
+            self._waiting.popleft()
+        self._waiting.append((task, is_scan))
+        self._changed.notify()
+
+    def _drop_scans(self) -> int:
+        commands = [item for item in self._waiting if not item[1]]
+        dropped = len(self._waiting) - len(commands)
+        self._waiting.clear()
+        self._waiting.extend(commands)
+        return dropped
 
     def _loop(self) -> None:
         me = threading.current_thread()
@@ -84,8 +136,19 @@ class Worker(Generic[T]):
             with self._changed:
                 while self._thread is me and not self._waiting:
                     self._changed.wait()
-                # Told to stop, or given up on while it hung, and another thread has taken its place.
                 if self._thread is not me:
                     return
-                item = self._waiting.popleft()
-            self._work(item)
+                task, _ = self._waiting.popleft()
+                self._busy_since = time.monotonic()
+            try:
+                task()
+            except Exception:
+                # One scan, or one command, is lost; the thread must outlive it.
+                log.exception("a task of the thread '%s' failed", self._name)
+            except BaseException as failure:
+                with self._changed:
+                    self._failure = f"{type(failure).__name__}: {failure}"
+                raise
+            finally:
+                with self._changed:
+                    self._busy_since = None

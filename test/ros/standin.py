@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import time
 import types
 from pathlib import Path
 from typing import Any
@@ -50,11 +51,17 @@ class StandIn:
         self.prior = self.stamp_ns = None
         self.resets += 1
 
+    def reconfigure(self, config: LocalizerNodeConfig) -> None:
+        self.config = config
+        self.calibration = effective_calibration(config.retrieval, self.encoder)
+
     def set_prior(self, prior: Any) -> None:
         self.prior = prior
 
     def localize(self, scan: Scan, gravity_base: Any = None, T_base_lidar: Any = None, motion: Any = None) -> Estimate:
         motion = motion() if callable(motion) else motion
+        if scan.frame_id == "slow":
+            time.sleep(5.0)
         prepared = prepare_scan(scan, self.config.scan, self.encoder.preprocessing, gravity_base, T_base_lidar)
         if prepared.patch is None:
             return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts)
@@ -171,7 +178,7 @@ def install_tf2() -> None:
 
 
 def main() -> int:
-    from crossloc3d_ros.ros.localizer_node import run_localizer
+    from crossloc3d_ros.ros.process import run_localizer
 
     if os.environ.get("STANDIN_TF2"):
         install_tf2()

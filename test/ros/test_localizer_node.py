@@ -49,7 +49,7 @@ TABLE = np.dtype(
 @pytest.fixture(scope="module")
 def localizer(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
     """One node for all tests that leave it as they find it: active, with its own settings, TF and all inputs."""
-    own = {"tf_broadcast": True, "use_imu_heading": True}
+    own = {"tf_broadcast": True, "use_imu_heading": True, "stall_s": 2.0}
     node = start_stand_in({**world.parameters(), **own}, environment={"STANDIN_TF2": "1"})
     node.wait_for_output("listening on /points")
     yield node
@@ -263,6 +263,21 @@ def test_an_initial_pose_reaches_the_localizer_in_the_grid(active: Robot, world:
     )
 
 
+def test_an_initial_pose_that_tf_explains_leaves_the_mounting_of_the_lidar_alone(active: Robot, world: World) -> None:
+    """Where mounting_from_tf is false: TF knows the frame of the clouds too, in another place than the settings."""
+    before = best_candidate(active, world, 18)
+    active.guesses.publish(guess("odom_far", -40.0, 90.0))
+    active.diagnosis_with("initial pose", "taken")
+    assert best_candidate(active, world, 18) == before
+
+
+def best_candidate(active: Robot, world: World, place: int) -> tuple[float, float, str]:
+    """Return position and descriptor distance of a scan's fix."""
+    fix = active.localize(world.points(place))
+    _, _, values = active.diagnosis_with("last best descriptor distance", "")
+    return fix.latitude, fix.longitude, values["last best descriptor distance"]
+
+
 def test_an_initial_pose_that_nothing_explains_is_refused_with_the_reason(active: Robot, world: World) -> None:
     for message, reason in (
         (guess("map", 5_000.0, 0.0), "outside of the map"),
@@ -459,6 +474,38 @@ def test_a_setting_of_the_localizer_takes_effect_while_it_runs(active: Robot, wo
     active.diagnosis("outside 1 to 5 m")
     assert set_parameter(active, "scan.max_range_m", double(100.0)) == (True, "")
     assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_FIX
+
+
+def test_a_setting_that_contradicts_another_is_refused_and_the_node_lives(active: Robot, world: World) -> None:
+    successful, why = set_parameter(active, "scan.min_range_m", double(100.0))
+    assert not successful
+    assert "'min_range_m' (100.0) must be below 'max_range_m' (100.0)" in why
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_FIX
+
+
+def test_a_setting_that_changes_keeps_an_initial_pose_and_what_is_known(active: Robot, world: World) -> None:
+    resets = active.told(active.message(world.points(16)))[1].split("resets ")[1].split(",")[0].split(";")[0]
+    active.guesses.publish(guess("map", 13.0, 14.0, yaw=1.0))
+    _, _, values = active.diagnosis_with("initial pose", "taken")
+    assert set_parameter(active, "fusion.max_speed_mps", double(11.0)) == (True, "")
+    message = active.told(active.message(world.points(16)))[1]
+    grid, _ = in_grid(frame_of(world), np.array([13.0, 14.0, 0.0]), 1.0)
+    assert f"prior at {grid[0]:.1f} {grid[1]:.1f}" in message
+    assert f"resets {resets}" in message
+    assert active.diagnosis_with("initial pose", "taken")[2]["initial pose"] == values["initial pose"]
+    assert set_parameter(active, "fusion.max_speed_mps", double(10.0)) == (True, "")
+
+
+def test_a_scan_that_does_not_end_is_an_error_and_the_state_is_stale(active: Robot, world: World) -> None:
+    active.localize(world.points(5))
+    slow = active.message(world.points(5))
+    slow.header.frame_id = "slow"
+    active.clouds.publish(slow)
+    level, message, _ = active.diagnosis("does not end")
+    assert level == 2
+    assert "the scan at work has taken" in message
+    active.wait_until(lambda: any("localized when last seen" in state.message for state in active.states))
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_FIX, "it has ended after all"
 
 
 def test_parameters_carry_description_and_range(active: Robot) -> None:

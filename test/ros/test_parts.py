@@ -9,9 +9,10 @@ import threading
 import time
 import types
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +27,9 @@ from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import LocalizerNodeConfig, MountingConfig, settings_of
 from crossloc3d_ros.errors import CloudError, ConfigError
 from crossloc3d_ros.localization.localizer import no_estimate
+from crossloc3d_ros.localization.session import Outcome
 from crossloc3d_ros.ros.conversions import matrix_from_transform, stamp_message
-from crossloc3d_ros.ros.diagnostics import Outcome, Statistics, judge_health
+from crossloc3d_ros.ros.diagnostics import Statistics, judge_health, worker_complaint
 from crossloc3d_ros.ros.shared_memory import PROFILES_VARIABLE, SEGMENT_BYTES, prepare_for_large_clouds
 from crossloc3d_ros.ros.transforms import TransformSource
 from crossloc3d_ros.ros.worker import Worker
@@ -51,49 +53,89 @@ class HeldWork:
         self.gate, self.begun = gate, threading.Event()
         self.done: list[int] = []
 
-    def __call__(self, item: int) -> None:
-        self.begun.set()
-        self.gate.wait(10)
-        self.done.append(item)
+    def on(self, item: int) -> Callable[[], None]:
+        """Return the task of working on `item`."""
+
+        def work() -> None:
+            self.begun.set()
+            self.gate.wait(10)
+            self.done.append(item)
+
+        return work
 
     def finish(self, count: int) -> None:
         """Open the gate and wait until so many items are done."""
         self.gate.set()
-        deadline = time.monotonic() + 5
-        while len(self.done) < count and time.monotonic() < deadline:
-            time.sleep(0.005)
+        wait_until(lambda: len(self.done) >= count)
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert condition()
+
+
+def started(queue_depth: int = 1) -> Worker:
+    worker = Worker("test", queue_depth)
+    worker.start(lambda: None)
+    return worker
 
 
 def test_only_the_newest_of_those_that_wait_is_worked_on(gate: threading.Event) -> None:
-    work = HeldWork(gate)
-    worker = Worker(work, "test")
-    worker.start(lambda: None)
-    assert worker.offer(0) == 0
+    work, worker = HeldWork(gate), started()
+    assert worker.offer(work.on(0)) == 0
     assert work.begun.wait(5)
-    assert [worker.offer(i) for i in range(1, 6)] == [0, 1, 1, 1, 1]
+    assert [worker.offer(work.on(i)) for i in range(1, 6)] == [0, 1, 1, 1, 1]
     work.finish(2)
     assert worker.stop()
     assert work.done == [0, 5]
 
 
 def test_a_few_may_wait_and_are_worked_on_in_their_order(gate: threading.Event) -> None:
-    work = HeldWork(gate)
-    worker = Worker(work, "test", queue_depth=3)
-    worker.start(lambda: None)
-    worker.offer(0)
+    work, worker = HeldWork(gate), started(queue_depth=3)
+    worker.offer(work.on(0))
     assert work.begun.wait(5)
-    assert [worker.offer(i) for i in range(1, 4)] == [0, 0, 0]
-    assert worker.offer(4) == 3, "more than may wait: the newest alone counts"
-    assert [worker.offer(i) for i in (5, 6)] == [0, 0]
+    assert [worker.offer(work.on(i)) for i in range(1, 4)] == [0, 0, 0]
+    assert worker.offer(work.on(4)) == 3, "more than may wait: the newest alone counts"
+    assert [worker.offer(work.on(i)) for i in (5, 6)] == [0, 0]
     work.finish(4)
-    assert worker.discard() == 0
+    assert worker.drop_scans() == 0
     assert worker.stop()
     assert work.done == [0, 4, 5, 6]
 
 
+def test_commands_keep_their_place_between_scans_and_are_not_dropped_with_them(gate: threading.Event) -> None:
+    work, worker = HeldWork(gate), started(queue_depth=2)
+    worker.offer(work.on(0))
+    assert work.begun.wait(5)
+    worker.offer(work.on(1))
+    worker.post(work.on(100))
+    worker.offer(work.on(2))
+    worker.post(work.on(101))
+    assert worker.offer(work.on(3)) == 2, "the scans that waited; no command"
+    assert worker.drop_scans() == 1
+    worker.offer(work.on(4))
+    work.finish(4)
+    assert worker.stop()
+    assert work.done == [0, 100, 101, 4]
+
+
+def test_a_worker_that_hangs_keeps_no_more_than_it_can_use(gate: threading.Event, monkeypatch: Any) -> None:
+    monkeypatch.setattr("crossloc3d_ros.ros.worker.MAX_WAITING", 50)
+    work, worker = HeldWork(gate), started()
+    worker.offer(work.on(-1))
+    assert work.begun.wait(5)
+    for i in range(200):
+        worker.post(work.on(i))
+    work.finish(51)
+    assert worker.stop()
+    assert work.done == [-1, *range(150, 200)]
+
+
 def test_preparation_runs_in_the_workers_thread_and_its_error_comes_back() -> None:
-    threads = []
-    worker = Worker(lambda item: threads.append(threading.current_thread().name), "localize")
+    threads: list[str] = []
+    worker = Worker("localize")
     worker.start(lambda: threads.append(threading.current_thread().name))
     assert threads == ["localize"]
     assert worker.stop()
@@ -107,30 +149,47 @@ def test_preparation_runs_in_the_workers_thread_and_its_error_comes_back() -> No
     assert worker.stop()
 
 
-def test_a_worker_that_hangs_is_reported_and_does_not_come_back(gate: threading.Event) -> None:
-    done: list[int] = []
-    begun = threading.Event()
-
-    def work(item: int) -> None:
-        begun.set()
-        if item == 0:
-            gate.wait(10)
-        done.append(item)
-
-    worker = Worker(work, "test")
-    worker.start(lambda: None)
-    worker.offer(0)
-    assert begun.wait(5)
+def test_a_worker_that_hangs_is_reported_and_never_works_beside_another(gate: threading.Event) -> None:
+    work, worker = HeldWork(gate), started()
+    assert worker_complaint(worker.health(), 0.01) == ""
+    worker.offer(work.on(0))
+    assert work.begun.wait(5)
+    time.sleep(0.05)
+    assert worker.health().busy_s > 0.01
+    assert "does not end" in worker_complaint(worker.health(), 0.01)
+    assert worker_complaint(worker.health(), 60.0) == ""
     assert not worker.stop(timeout_s=0.05)
+    with pytest.raises(ConfigError, match="does not end: clean the node up"):
+        worker.start(lambda: None)
+    work.finish(1)
+    wait_until(lambda: not [thread for thread in threading.enumerate() if thread.name == "test"])
     worker.start(lambda: None)
-    gate.set()
-    worker.offer(1)
-    deadline = time.monotonic() + 5
-    while len(done) < 2 and time.monotonic() < deadline:
-        time.sleep(0.005)
+    assert worker.health().busy_s == 0.0
     assert worker.stop()
-    assert sorted(done) == [0, 1]
-    assert not [t for t in threading.enumerate() if t.name == "test"], "the one that hung has ended too"
+
+
+def test_a_task_that_fails_costs_itself_alone(gate: threading.Event) -> None:
+    def fail() -> None:
+        raise RuntimeError("a fault")
+
+    work, worker = HeldWork(gate), started()
+    worker.post(fail)
+    worker.offer(work.on(1))
+    work.finish(1)
+    assert worker.health().is_alive
+    assert worker.stop()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_worker_whose_thread_ends_says_why() -> None:
+    def end() -> None:
+        raise SystemExit("told to")
+
+    worker = started()
+    worker.post(end)
+    wait_until(lambda: not worker.health().is_alive)
+    assert "the thread that localizes has ended (SystemExit: told to)" in worker_complaint(worker.health(), 60.0)
+    assert worker.stop()
 
 
 # Shared memory

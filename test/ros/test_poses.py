@@ -21,11 +21,9 @@ from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
-from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import CloudError, ConfigError, PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.ros import conversions
 from crossloc3d_ros.ros.conversions import (
@@ -41,7 +39,7 @@ from crossloc3d_ros.ros.conversions import (
     state_message,
     transform_message,
 )
-from crossloc3d_ros.ros.odometry_input import OdometryInput, OdometryState, odometry_complaint
+from crossloc3d_ros.ros.odometry_input import OdometryInput, OdometrySample, OdometryState, odometry_complaint
 from crossloc3d_ros.ros.poses import heading_prior, initial_pose
 from crossloc3d_ros.ros.transforms import MapTransform
 from crossloc3d_ros.types import FixStatus, TrackState
@@ -211,8 +209,8 @@ def odometry_message(stamp_ns: int, T: np.ndarray, child_frame_id: str = "base_l
     return message
 
 
-def odometry_input(wait_s: float = 0.5, **how: Any) -> OdometryInput:
-    return OdometryInput(OdometryBuffer(FusionConfig()), "base_link", wait_s, **how)
+def odometry_input(timeout_s: float = 0.5, odom_frame_id: str = "", **how: Any) -> OdometryInput:
+    return OdometryInput("base_link", odom_frame_id, timeout_s, **how)
 
 
 def fill(odometry: OdometryInput, seconds: float, step_s: float = 0.02, begin_s: float = 0.0) -> None:
@@ -226,57 +224,44 @@ def on_the_ramp(t: float) -> np.ndarray:
     return motion(2.0 * t, 0.0, 0.2 * t, 0.3 * t, pitch=-0.1, roll=0.02)
 
 
-def test_the_whole_pose_is_interpolated() -> None:
-    odometry = odometry_input()
-    fill(odometry, 1.0)
-    for t in np.random.default_rng(0).uniform(0.0, 1.0, 100):
-        T = odometry.pose_at(STAMP_NS + round(t * 1e9))
-        assert T is not None
-        np.testing.assert_allclose(T, on_the_ramp(t), atol=1e-4)
-
-
-def test_no_pose_is_told_where_none_is_known() -> None:
-    odometry = odometry_input()
-    assert odometry.pose_at(STAMP_NS) is None
-    fill(odometry, 1.0)
-    assert odometry.pose_at(STAMP_NS - 1) is None
-    assert odometry.pose_at(STAMP_NS + 1_000_000_001) is None
-    fill(odometry, 1.0, begin_s=5.0)
-    assert odometry.pose_at(STAMP_NS + 3_000_000_000) is None, "in a gap"
-    jump = on_the_ramp(6.02)
-    jump[0, 3] += 30.0
-    odometry.take(odometry_message(STAMP_NS + 6_020_000_000, jump))
-    assert odometry.pose_at(STAMP_NS + 6_010_000_000) is None, "in a jump"
-    # A bag that begins again.
-    fill(odometry, 0.1)
-    assert odometry.pose_at(STAMP_NS + 50_000_000) is not None
-    assert odometry.pose_at(STAMP_NS + 5_500_000_000) is None
-
-
 def test_a_scan_waits_for_the_odometry_of_its_stamp_but_not_for_a_silent_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    odometry = odometry_input(wait_s=5.0)
+    odometry, taken = odometry_input(timeout_s=5.0), []
+
+    def add(sample: OdometrySample) -> bool:
+        taken.append(sample.stamp_ns)
+        return sample.stamp_ns >= STAMP_NS + 1_000_000_000
+
     fill(odometry, 0.5)
-    late = threading.Timer(0.1, lambda: fill(odometry, 0.5, begin_s=0.5))
+    late = threading.Timer(0.1, lambda: fill(odometry, 0.5, begin_s=0.52))
     late.start()
-    known = odometry.motion(STAMP_NS, STAMP_NS + 1_000_000_000)
+    odometry.wait(add)
     late.join()
-    assert known.is_known
-    assert math.hypot(*known.delta[:2]) == pytest.approx(2.0, abs=1e-3)
-    # Nothing comes any more: the answer does.
+    assert taken == [STAMP_NS + 20_000_000 * i for i in range(51)], "all in their order, and none beyond"
+    assert [sample.stamp_ns for sample in odometry.drain()] == [STAMP_NS + 1_020_000_000], "what came later is kept"
+    # Nothing comes any more: it gives up.
     begun = time.monotonic()
-    odometry_input(wait_s=0.05).motion(STAMP_NS, STAMP_NS + 1)
+    odometry_input(timeout_s=0.05).wait(add)
     assert time.monotonic() - begun < 2.0
     now = time.monotonic()
     monkeypatch.setattr("crossloc3d_ros.ros.odometry_input.time.monotonic", lambda: now + 2.0)
-    unknown = odometry.motion(STAMP_NS, STAMP_NS + 9_000_000_000)
-    assert not unknown.is_known, "and that without waiting, or this test would not end: its clock stands"
+    odometry.wait(add)  # and that without waiting, or this test would not end: its clock stands
+
+
+def test_odometry_in_another_frame_than_the_one_named_is_refused() -> None:
+    odometry = odometry_input(odom_frame_id="odom_wheels")
+    with pytest.raises(PoseError, match="given in 'odom', not in 'odom_wheels': set odom_frame_id to 'odom'"):
+        odometry.take(odometry_message(STAMP_NS, np.eye(4)))
+    odometry = odometry_input(odom_frame_id="odom")
+    odometry.take(odometry_message(STAMP_NS, np.eye(4)))
+    assert [sample.odom_frame_id for sample in odometry.drain()] == ["odom"]
 
 
 def test_odometry_of_another_frame_is_brought_to_the_base_where_tf_relates_them() -> None:
     T_base_imu = motion(0.4, 0.1, 0.3, 2.0, pitch=0.2)
     odometry = odometry_input(pose_on_base=lambda frame: T_base_imu)
     odometry.take(odometry_message(STAMP_NS, on_the_ramp(0.0) @ T_base_imu, "imu_link"))
-    np.testing.assert_allclose(odometry.pose_at(STAMP_NS), on_the_ramp(0.0), atol=1e-9)
+    (sample,) = odometry.drain()
+    np.testing.assert_allclose(sample.T_odom_base, on_the_ramp(0.0), atol=1e-9)
 
     def nothing(frame: str) -> np.ndarray:
         raise CloudError(f"TF knows no pose of '{frame}' on 'base_link'")

@@ -10,19 +10,19 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import LocalizerConfig, to_dict
-from crossloc3d_ros.datasets.pose_drives import Journey, JourneyStep, RawDrive, load_drives, steps_of
+from crossloc3d_ros.datasets.pose_drives import Journey, RawDrive, load_drives, steps_of
 from crossloc3d_ros.datasets.pose_sets import PoseSet, Progress, load_pose_set
 from crossloc3d_ros.datasets.raw_scans import RawScan
-from crossloc3d_ros.errors import CloudError, EvaluationError
+from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
-from crossloc3d_ros.localization.localizer import Localizer, no_estimate
+from crossloc3d_ros.localization.localizer import Localizer
+from crossloc3d_ros.localization.session import OdometryKind, ScanLocalizer, Session
 from crossloc3d_ros.types import (
     BoolArray,
     DescriptorEncoder,
@@ -30,13 +30,13 @@ from crossloc3d_ros.types import (
     FixStatus,
     Float64Array,
     Int64Array,
-    Scan,
     TrackState,
 )
 from crossloc3d_ros.workers import EncoderLoader, open_workers
 
 FORMAT = 1
 Odometry = Literal["wheels", "scan", "none"]
+_SESSION_ODOMETRY: dict[Odometry, OdometryKind] = {"wheels": "topic", "scan": "scan", "none": "none"}
 """What tells how the robot moves: its wheels, its scans, nothing."""
 CANDIDATES, ALIGNED = 25, 25
 """How many of each scan's candidates and aligned poses are kept."""
@@ -47,26 +47,6 @@ _ALONE = -2
 """Scans of journey j that were asked again from nothing are of the journey `_ALONE - j`."""
 _ALONE_EVERY = 5
 _SINGLES_AT_ONCE = 16
-
-
-class PoseLocalizer(Protocol):
-    """What is examined: `localization.localizer.Localizer`."""
-
-    @property
-    def stamp_ns(self) -> int | None:
-        """Stamp of the scan at which the next motion begins; None before the first."""
-
-    def localize(
-        self,
-        scan: Scan,
-        gravity_base: Float64Array | None = None,
-        T_base_lidar: Float64Array | None = None,
-        motion: Motion | None = None,
-    ) -> Estimate:
-        """Return where a scan was taken."""
-
-    def reset(self) -> None:
-        """Forget all that was seen before."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +179,7 @@ def _do(task: _Task, encoder: DescriptorEncoder, advance: Callable[[int], None] 
         scans = _set_of(task.folder, task.map_folder).scans
         return predict_singles([scans[i] for i in task.singles], localizer, frame, told)
     number, journey = task.journey
-    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.config, task.odometry, told)
+    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.odometry, told)
 
 
 @functools.lru_cache(maxsize=1)
@@ -217,10 +197,10 @@ def _drives_of(folder: Path) -> tuple[RawDrive, ...]:
     return tuple(load_drives(folder))
 
 
-_localizers: dict[tuple[Path, str, LocalizerConfig], PoseLocalizer] = {}
+_localizers: dict[tuple[Path, str, LocalizerConfig], ScanLocalizer] = {}
 
 
-def _localizer_of(folder: Path, encoder: DescriptorEncoder, config: LocalizerConfig) -> PoseLocalizer:
+def _localizer_of(folder: Path, encoder: DescriptorEncoder, config: LocalizerConfig) -> ScanLocalizer:
     """Return this process's localizer: a worker does many tasks with one."""
     key = (folder, encoder.fingerprint, config)
     if key not in _localizers:
@@ -233,15 +213,16 @@ def _localizer_of(folder: Path, encoder: DescriptorEncoder, config: LocalizerCon
 
 def predict_singles(
     scans: Sequence[RawScan],
-    localizer: PoseLocalizer,
+    localizer: ScanLocalizer,
     frame: MapFrame,
     advance: Callable[[int], None] = lambda _: None,
 ) -> PosePredictions:
     """Ask for each scan as if it were the first of all."""
     rows = []
+    session = Session(localizer)
     for scan in scans:
-        localizer.reset()
-        estimate = _ask(localizer, scan, None)
+        session.reset()
+        estimate = _localize(session, scan)
         rows.append(_row(scan, estimate, frame, SINGLE, 0, 0.0))
         advance(1)
     return join(rows)
@@ -251,51 +232,29 @@ def predict_journey(
     number: int,
     journey: Journey,
     drives: Sequence[RawDrive],
-    localizer: PoseLocalizer,
+    localizer: ScanLocalizer,
     frame: MapFrame,
-    config: LocalizerConfig,
     odometry: Odometry = "wheels",
     advance: Callable[[int], None] = lambda _: None,
 ) -> PosePredictions:
     """Ask for each scan of a journey, with the odometry that has arrived until then."""
     localizer.reset()
-    motions = _Motions(odometry, config)
+    session = Session(localizer, _SESSION_ODOMETRY[odometry])
     rows = []
     for step in steps_of(journey, drives):
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
-        motions.take(step, scan)
-        estimate = _ask(localizer, scan, motions.between(localizer.stamp_ns, step.stamp_ns))
+        for stamp_ns, (x, y, heading) in zip(step.odometry_ns.tolist(), step.odometry.tolist(), strict=True):
+            session.add_odometry(stamp_ns, _planar_pose(x, y, heading))
+        estimate = _localize(session, scan)
         rows.append(_row(scan, estimate, frame, number, step.leg, step.travelled_m))
         advance(1)
     # Some of them again, alone: what a scan tells by itself, against what the way until there tells.
+    session = Session(localizer)
     for step in [step for step in steps_of(journey, drives) if step.leg == 0][::_ALONE_EVERY]:
-        localizer.reset()
+        session.reset()
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
-        rows.append(_row(scan, _ask(localizer, scan, None), frame, _ALONE - number, 0, step.travelled_m))
+        rows.append(_row(scan, _localize(session, scan), frame, _ALONE - number, 0, step.travelled_m))
     return join(rows)
-
-
-class _Motions:
-    """How the robot moved between scans, as the odometry chosen tells it."""
-
-    def __init__(self, odometry: Odometry, config: LocalizerConfig) -> None:
-        self._wheels = OdometryBuffer(config.fusion) if odometry == "wheels" else None
-        self._scans = ScanOdometry(config.fusion, config.scan.max_range_m) if odometry == "scan" else None
-        self._max_range_m = config.scan.max_range_m
-
-    def take(self, step: JourneyStep, scan: RawScan) -> None:
-        """Take in a scan and the odometry that came before it."""
-        if self._wheels is not None:
-            for stamp_ns, (x, y, heading) in zip(step.odometry_ns.tolist(), step.odometry.tolist(), strict=True):
-                self._wheels.add(stamp_ns, _planar_pose(x, y, heading))
-        if self._scans is not None:
-            points = scan.points[np.linalg.norm(scan.points, axis=1) <= self._max_range_m].astype(np.float64)
-            self._scans.add(scan.stamp_ns, points @ scan.T_base_lidar[:3, :3].T + scan.T_base_lidar[:3, 3])
-
-    def between(self, from_ns: int | None, to_ns: int) -> Motion | None:
-        """Return the motion between two stamps; None where nothing tells it."""
-        source = self._scans if self._wheels is None else self._wheels
-        return None if from_ns is None or source is None else source.motion(from_ns, to_ns)
 
 
 def number_of_alone(predictions: PosePredictions) -> Int64Array:
@@ -303,11 +262,8 @@ def number_of_alone(predictions: PosePredictions) -> Int64Array:
     return _ALONE - predictions.journey
 
 
-def _ask(localizer: PoseLocalizer, scan: RawScan, motion: Motion | None) -> Estimate:
-    try:
-        return localizer.localize(scan.as_scan(), scan.up_base, scan.T_base_lidar, motion)
-    except CloudError as error:  # a cloud that cannot be used is an answer too
-        return no_estimate(scan.stamp_ns, str(error))
+def _localize(session: Session, scan: RawScan) -> Estimate:
+    return session.localize(session.receive(scan.as_scan(), scan.T_base_lidar, scan.up_base)).estimate
 
 
 def _planar_pose(x: float, y: float, heading: float) -> Float64Array:

@@ -63,12 +63,17 @@ class Aligner:
 
     def __init__(self, aerial_map: AerialMap, config: AlignmentConfig, model: ObservationModel | None = None) -> None:
         """Bring map and observation model (the shipped one by default) together."""
-        self.aerial_map, self.config = aerial_map, config
+        self.aerial_map = aerial_map
         self.model = model or ObservationModel.load()
         self.likelihood = MapLikelihood(aerial_map, self.model)
         self.threads = usable_threads()
         west, south, east, north = aerial_map.bounds
         self.area_m2 = (east - west) * (north - south)
+        self.reconfigure(config)
+
+    def reconfigure(self, config: AlignmentConfig) -> None:
+        """Use other settings from the next scan on; what was read of the map is kept."""
+        self.config = config
         self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
 
     @property

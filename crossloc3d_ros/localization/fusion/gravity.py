@@ -14,11 +14,14 @@ STALE_NS = 1_000_000_000
 """An average that has seen nothing for so long says nothing about the present."""
 
 
-class GravityFilter:
-    """Low-pass a stream of specific forces (m/s2, base frame, +z up at rest) into the direction that points up.
+def is_gravity(acceleration: Float64Array) -> bool:
+    """Return whether a specific force (3,), m/s2, can be that of gravity; one that is not a number cannot."""
+    low, high = PLAUSIBLE_MPS2
+    return low <= float(np.linalg.norm(acceleration)) <= high
 
-    One thread may feed it while another asks.
-    """
+
+class GravityFilter:
+    """Low-pass a stream of specific forces (m/s2, base frame, +z up at rest) into the direction that points up."""
 
     def __init__(self, time_constant_s: float) -> None:
         self._time_constant_ns = time_constant_s * 1e9
@@ -31,9 +34,7 @@ class GravityFilter:
 
     def update(self, stamp_ns: int, acceleration: Float64Array) -> bool:
         """Take in one sample (3,) and return whether it was plausible; a stamp that goes backwards starts anew."""
-        low, high = PLAUSIBLE_MPS2
-        # Written so that NaN is refused too.
-        if not low <= float(np.linalg.norm(acceleration)) <= high:
+        if not is_gravity(acceleration):
             return False
         elapsed_ns = stamp_ns - self._stamp_ns
         if self._mean is None or not 0 <= elapsed_ns <= STALE_NS:
@@ -46,7 +47,6 @@ class GravityFilter:
 
     def up(self, stamp_ns: int) -> Float64Array | None:
         """Return the unit vector (3,) that points up in the base frame; None where no recent sample tells it."""
-        mean = self._mean  # read once: another thread may take in samples or reset meanwhile
-        if mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
+        if self._mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
             return None
-        return np.asarray(mean / np.linalg.norm(mean))
+        return np.asarray(self._mean / np.linalg.norm(self._mean))

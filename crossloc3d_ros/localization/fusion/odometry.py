@@ -5,17 +5,19 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import math
-import threading
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import ConfigError
 from crossloc3d_ros.types import Float32Array, Float64Array
 
 _KEPT_NS = 120_000_000_000
+_TRANSFORMS = 2000  # ten seconds at 200 Hz, far more than a scan takes
 _SCAN_GAP_S = 1.5  # scans farther apart than this share too little to be aligned with each other while driving
 _LEAST_POINTS = 100
 _STAND_STILL_M = 0.01  # one sigma of a motion's position and, in radians, a tenth of it of its heading: never 0
@@ -41,18 +43,22 @@ def unknown_motion(reason: str) -> Motion:
 
 
 class OdometryBuffer:
-    """Keep the samples of an odometry and tell the motion between any two stamps.
-
-    One thread may feed it while another asks.
-    """
+    """Keep the samples of an odometry; return the motion between any two stamps, and the pose at a recent one."""
 
     def __init__(self, config: FusionConfig) -> None:
         self._config = config
-        self._lock = threading.Lock()
         self._stamps_ns: list[int] = []
         self._poses: list[tuple[float, float, float]] = []  # x, y, heading in the odometry's frame, levelled
         self._jumps: list[str] = []  # what is impossible in the step that ends at the sample; empty where nothing is
+        self._transforms: deque[Float64Array] = deque(maxlen=_TRANSFORMS)  # the whole poses of the newest samples
         self._refused = ""
+
+    def reconfigure(self, config: FusionConfig) -> None:
+        """Use other settings from now on, for the samples that are there too."""
+        self._config = config
+        stamps, poses = self._stamps_ns, self._poses
+        steps = zip(stamps, poses, stamps[1:], poses[1:], strict=False)
+        self._jumps = ["", *(_impossible(*step, config) for step in steps)] if stamps else []
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -68,8 +74,7 @@ class OdometryBuffer:
 
     def reset(self) -> None:
         """Forget all samples."""
-        with self._lock:
-            self._clear()
+        self._clear()
 
     def add(self, stamp_ns: int, T_odom_base: Float64Array) -> bool:
         """Take in one pose (4, 4) of the base, and return whether it can be used.
@@ -78,21 +83,22 @@ class OdometryBuffer:
         begins anew.
         """
         pose = _planar(np.asarray(T_odom_base, dtype=np.float64))
-        with self._lock:
-            if pose is None:
-                self._refused = "the last pose of the odometry is not a pose"
-                return False
-            self._refused = ""
-            if self.is_late(stamp_ns):
-                return False
-            if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
-                self._clear()
-            self._jumps.append(self._impossible(stamp_ns, pose))
-            self._stamps_ns.append(stamp_ns)
-            self._poses.append(pose)
-            if stamp_ns - self._stamps_ns[0] > 2 * _KEPT_NS:
-                old = bisect.bisect_left(self._stamps_ns, stamp_ns - _KEPT_NS)
-                del self._stamps_ns[:old], self._poses[:old], self._jumps[:old]
+        if pose is None:
+            self._refused = "the last pose of the odometry is not a pose"
+            return False
+        self._refused = ""
+        if self.is_late(stamp_ns):
+            return False
+        if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+            self._clear()
+        stamps, poses = self._stamps_ns, self._poses
+        self._jumps.append(_impossible(stamps[-1], poses[-1], stamp_ns, pose, self._config) if stamps else "")
+        stamps.append(stamp_ns)
+        poses.append(pose)
+        self._transforms.append(np.asarray(T_odom_base, dtype=np.float64))
+        if stamp_ns - stamps[0] > 2 * _KEPT_NS:
+            old = bisect.bisect_left(stamps, stamp_ns - _KEPT_NS)
+            del stamps[:old], poses[:old], self._jumps[:old]
         return True
 
     def motion(self, from_ns: int, to_ns: int) -> Motion:
@@ -101,14 +107,13 @@ class OdometryBuffer:
         Beyond the newest sample it goes on as before for up to `odometry_max_gap_s`. Unknown where there are no
         samples, a gap, a jump that no robot drives, or time that goes backwards.
         """
-        with self._lock:
-            stamps, poses = self._stamps_ns, self._poses
-            gap_ns = int(self._config.odometry_max_gap_s * 1e9)
-            reason = self._why_unknown(from_ns, to_ns, gap_ns)
-            if reason:
-                return unknown_motion(reason)
-            first, last = bisect.bisect_right(stamps, from_ns), bisect.bisect_left(stamps, to_ns)
-            way = np.array([self._at(from_ns), *poses[first:last], self._at(to_ns)])
+        stamps, poses = self._stamps_ns, self._poses
+        gap_ns = int(self._config.odometry_max_gap_s * 1e9)
+        reason = self._why_unknown(from_ns, to_ns, gap_ns)
+        if reason:
+            return unknown_motion(reason)
+        first, last = bisect.bisect_right(stamps, from_ns), bisect.bisect_left(stamps, to_ns)
+        way = np.array([self._at(from_ns), *poses[first:last], self._at(to_ns)])
         steps = np.diff(way, axis=0)
         turns = _wrap(steps[:, 2])
         heading = way[0, 2]
@@ -118,23 +123,32 @@ class OdometryBuffer:
         length_m, turned_rad = float(np.hypot(steps[:, 0], steps[:, 1]).sum()), float(np.abs(turns).sum())
         return Motion(delta, motion_covariance(length_m, turned_rad, self._config))
 
+    def pose_at(self, stamp_ns: int) -> Float64Array | None:
+        """Return `T_odom_base` (4, 4) at a stamp: linear translation, spherical rotation between two samples.
+
+        None beyond the samples of the last seconds, within a gap and within a jump.
+        """
+        after = bisect.bisect_left(self._stamps_ns, stamp_ns)
+        newest = after - len(self._stamps_ns) + len(self._transforms)  # row among the whole poses
+        if after == len(self._stamps_ns) or newest < 0:
+            return None
+        end_ns, T_end = self._stamps_ns[after], self._transforms[newest]
+        if end_ns == stamp_ns:
+            return T_end
+        if newest == 0:
+            return None
+        begin_ns, T_begin = self._stamps_ns[after - 1], self._transforms[newest - 1]
+        if not self.motion(begin_ns, end_ns).is_known:
+            return None
+        share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+        T = np.eye(4)
+        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix([T_begin[:3, :3], T_end[:3, :3]]))(share).as_matrix()
+        T[:3, 3] = T_begin[:3, 3] + share * (T_end[:3, 3] - T_begin[:3, 3])
+        return T
+
     def _clear(self) -> None:
         self._stamps_ns, self._poses, self._jumps = [], [], []
-
-    def _impossible(self, stamp_ns: int, pose: tuple[float, float, float]) -> str:
-        """Say what no robot does between the newest sample and this one; empty where it is possible."""
-        if not self._poses:
-            return ""
-        before = self._poses[-1]
-        # A burst of samples with the jitter of its stamps is no jump: a hundredth of a second is granted.
-        elapsed_s = (stamp_ns - self._stamps_ns[-1]) * 1e-9 + 0.01
-        moved_m = math.hypot(pose[0] - before[0], pose[1] - before[1])
-        turned_deg = abs(math.degrees(_wrap(pose[2] - before[2])))
-        if moved_m > self._config.max_speed_mps * elapsed_s + 0.05:
-            return f"the odometry jumps by {moved_m:.2g} m in {elapsed_s:.2g} s"
-        if turned_deg > self._config.max_turn_deg_per_s * elapsed_s + 1.0:
-            return f"the odometry jumps by {turned_deg:.0f} degrees in {elapsed_s:.2g} s"
-        return ""
+        self._transforms.clear()
 
     def _why_unknown(self, from_ns: int, to_ns: int, gap_ns: int) -> str:
         stamps = self._stamps_ns
@@ -185,6 +199,14 @@ class ScanOdometry:
         self._odometry = _kiss_icp(self._max_range_m)
         self._buffer.reset()
 
+    def reconfigure(self, config: FusionConfig, max_range_m: float) -> None:
+        """Use other settings from now on; another range begins a new odometry after the next scan."""
+        self._gap_s = max(config.odometry_max_gap_s, _SCAN_GAP_S)
+        self._buffer.reconfigure(dataclasses.replace(config, odometry_max_gap_s=self._gap_s))
+        if max_range_m != self._max_range_m:
+            self._max_range_m = max_range_m
+            self.reset()
+
     def add(self, stamp_ns: int, points: Float32Array | Float64Array) -> bool:
         """Take in one scan (N, 3), metres, base frame, and return whether it can be used.
 
@@ -205,6 +227,25 @@ class ScanOdometry:
     def motion(self, from_ns: int, to_ns: int) -> Motion:
         """Return how the base moved between the stamps of two scans."""
         return self._buffer.motion(from_ns, to_ns)
+
+
+def _impossible(
+    begin_ns: int,
+    begin: tuple[float, float, float],
+    end_ns: int,
+    end: tuple[float, float, float],
+    config: FusionConfig,
+) -> str:
+    """Return what no robot does between two samples; empty where the step is possible."""
+    # A burst of samples with the jitter of its stamps is no jump: a hundredth of a second is granted.
+    elapsed_s = (end_ns - begin_ns) * 1e-9 + 0.01
+    moved_m = math.hypot(end[0] - begin[0], end[1] - begin[1])
+    turned_deg = abs(math.degrees(_wrap(end[2] - begin[2])))
+    if moved_m > config.max_speed_mps * elapsed_s + 0.05:
+        return f"the odometry jumps by {moved_m:.2g} m in {elapsed_s:.2g} s"
+    if turned_deg > config.max_turn_deg_per_s * elapsed_s + 1.0:
+        return f"the odometry jumps by {turned_deg:.0f} degrees in {elapsed_s:.2g} s"
+    return ""
 
 
 def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) -> Float64Array:

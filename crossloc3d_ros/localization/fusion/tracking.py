@@ -138,6 +138,10 @@ class Tracker:
         """Whether the scan that `predict` was told of changes nothing: it is late, or a repeated one."""
         return bool(self._skipped)
 
+    def reconfigure(self, config: FusionConfig) -> None:
+        """Use other settings from the next scan on; the hypotheses are kept."""
+        self._config = config
+
     def reset(self) -> None:
         """Forget everything."""
         self._stamp_ns: int | None = None

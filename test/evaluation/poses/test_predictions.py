@@ -69,12 +69,14 @@ class Knowing:
     """A localizer that is told the poses of the scans by their points, and writes down what it is asked."""
 
     def __init__(self) -> None:
+        self.config = LocalizerConfig()
         self.asked: list[tuple[str, object]] = []
         self.stamp_ns: int | None = None
 
     def localize(self, scan: Scan, gravity_base=None, T_base_lidar=None, motion=None) -> Estimate:
         if not len(scan.points):
             raise CloudError("the cloud is empty")
+        motion = motion() if callable(motion) else motion
         self.asked.append(("scan", (scan.stamp_ns, gravity_base, T_base_lidar, motion)))
         self.stamp_ns = scan.stamp_ns
         x, y, heading = scan.points[0].astype(np.float64)
@@ -147,7 +149,7 @@ def test_a_cloud_that_cannot_be_used_is_an_answer_without_a_pose() -> None:
 def test_along_a_journey_the_motion_since_the_last_scan_is_told() -> None:
     localizer = Knowing()
     drives = [straight_drive(0), straight_drive(1)]
-    rows = predict_journey(3, Journey((Leg(0), Leg(1, 6.0))), drives, localizer, FRAME, LocalizerConfig())
+    rows = predict_journey(3, Journey((Leg(0), Leg(1, 6.0))), drives, localizer, FRAME)
     alone = number_of_alone(rows) == 3
     assert alone.sum() == 3  # each fifth of twelve
     first = localizer.asked[: 1 + 12 + 6]
@@ -171,7 +173,7 @@ def test_along_a_journey_the_motion_since_the_last_scan_is_told() -> None:
 def test_without_odometry_no_motion_is_told() -> None:
     localizer = Knowing()
     drives = [straight_drive(0), straight_drive(1)]
-    predict_journey(0, Journey((Leg(0), Leg(1))), drives, localizer, FRAME, LocalizerConfig(), "none")
+    predict_journey(0, Journey((Leg(0), Leg(1))), drives, localizer, FRAME, "none")
     assert {values[3] for what, values in localizer.asked if what == "scan"} == {None}
 
 
@@ -182,7 +184,7 @@ def test_a_scan_that_does_not_count_is_no_beginning_of_a_motion() -> None:
     scans = [drive.scans[i] for i in range(len(drive.scans))]
     scans[4] = dataclasses.replace(scans[4], points=np.zeros((0, 3), np.float32))
     drive = dataclasses.replace(drive, scans=RawScans.of(scans))
-    rows = predict_journey(0, Journey((Leg(0),)), [drive], localizer, FRAME, LocalizerConfig())
+    rows = predict_journey(0, Journey((Leg(0),)), [drive], localizer, FRAME)
     motions = [values[3] for what, values in localizer.asked[1:12] if what == "scan"]
     assert [round(motion.delta[0]) for motion in motions[1:]] == [1, 1, 1, 2, 1, 1, 1, 1, 1, 1]
     assert np.isnan(rows.pose[4]).all()
@@ -194,7 +196,7 @@ def test_scans_asked_again_stand_beside_those_of_the_track(tmp_path: Path) -> No
     journeys = (Journey((Leg(0), Leg(1))), Journey((Leg(1), Leg(0))))
     rows = join(
         [
-            *(predict_journey(i, j, drives, localizer, FRAME, LocalizerConfig()) for i, j in enumerate(journeys)),
+            *(predict_journey(i, j, drives, localizer, FRAME) for i, j in enumerate(journeys)),
             predict_singles([scan_at(0.0, 1.0, 2.0)], localizer, FRAME),
         ]
     )

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import ConfigError
@@ -242,3 +243,76 @@ def test_scans_too_far_apart_in_time_tell_nothing_and_a_new_recording_begins_ane
     assert scans.add(SECOND // 10, points)
     np.testing.assert_allclose(scans.motion(0, SECOND // 10).delta, [0.1, 0, 0], atol=0.05)
     assert not scans.add(SECOND // 5, np.empty((0, 3))), "a scan without points"
+
+
+# The pose at a stamp
+
+
+def on_the_ramp(t: float) -> np.ndarray:
+    """A robot on a ramp, in a bend: 2 m/s."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", [0.3 * t, -0.1, 0.02]).as_matrix()
+    T[:3, 3] = [2.0 * t, 0.0, 0.2 * t]
+    return T
+
+
+def fill(buffer: OdometryBuffer, seconds: float, step_s: float = 0.02, begin_s: float = 0.0) -> None:
+    for i in range(round(seconds / step_s) + 1):
+        t = begin_s + i * step_s
+        buffer.add(START_NS + round(t * 1e9), on_the_ramp(t))
+
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def test_the_whole_pose_is_interpolated() -> None:
+    buffer = OdometryBuffer(FusionConfig())
+    fill(buffer, 1.0)
+    for t in np.random.default_rng(0).uniform(0.0, 1.0, 100):
+        T = buffer.pose_at(START_NS + round(t * 1e9))
+        assert T is not None
+        np.testing.assert_allclose(T, on_the_ramp(t), atol=1e-4)
+
+
+def test_no_pose_is_given_where_none_is_known() -> None:
+    buffer = OdometryBuffer(FusionConfig())
+    assert buffer.pose_at(START_NS) is None
+    fill(buffer, 1.0)
+    assert buffer.pose_at(START_NS - 1) is None
+    assert buffer.pose_at(START_NS + 1_000_000_001) is None
+    fill(buffer, 1.0, begin_s=5.0)
+    assert buffer.pose_at(START_NS + 3_000_000_000) is None, "in a gap"
+    jump = on_the_ramp(6.02)
+    jump[0, 3] += 30.0
+    buffer.add(START_NS + 6_020_000_000, jump)
+    assert buffer.pose_at(START_NS + 6_010_000_000) is None, "in a jump"
+    fill(buffer, 0.1)
+    assert buffer.pose_at(START_NS + 50_000_000) is not None, "a recording that begins again"
+    assert buffer.pose_at(START_NS + 5_500_000_000) is None
+
+
+def test_whole_poses_are_kept_for_the_newest_samples_alone() -> None:
+    buffer = OdometryBuffer(FusionConfig())
+    fill(buffer, 50.0)
+    assert buffer.pose_at(START_NS + 5_000_000_000) is None
+    T = buffer.pose_at(START_NS + 45_010_000_000)
+    assert T is not None
+    np.testing.assert_allclose(T, on_the_ramp(45.01), atol=1e-4)
+    assert buffer.motion(START_NS + 5_000_000_000, START_NS + 6_000_000_000).is_known
+
+
+def test_other_settings_hold_for_the_samples_that_are_there_too() -> None:
+    slow, fast = FusionConfig(max_speed_mps=1.0), FusionConfig(max_speed_mps=10.0)
+    buffer = OdometryBuffer(fast)
+    fill(buffer, 1.0, step_s=0.25)
+    way = START_NS, START_NS + 1_000_000_000
+    before = buffer.motion(*way)
+    assert before.is_known
+    buffer.reconfigure(slow)
+    assert "jumps by" in buffer.motion(*way).reason
+    buffer.reconfigure(fast)
+    again = buffer.motion(*way)
+    assert again.is_known
+    np.testing.assert_array_equal(again.delta, before.delta)
+    buffer.reconfigure(FusionConfig(odometry_max_gap_s=0.1))
+    assert "gap" in buffer.motion(*way).reason

@@ -1,0 +1,198 @@
+"""One robot's run: scans, odometry, accelerations and priors in, one outcome a scan out.
+
+The node, the replay and the pose benchmark feed the localizer through this one object, so that the same inputs give the
+same estimates in all three. It has no threads and no locks: whoever owns it feeds it in the order of the inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from crossloc3d_ros.clouds.filters import mounting_matrix, transform_points
+from crossloc3d_ros.config import LocalizerConfig
+from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.localization.estimates import no_estimate
+from crossloc3d_ros.localization.fusion.gravity import GravityFilter
+from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
+from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
+
+OdometryKind = Literal["topic", "scan", "none"]
+"""What measures the motion between scans: samples of odometry, the scans themselves by KISS-ICP, or nothing."""
+SAME_CLOCK_NS = 10_000_000_000
+"""A prior stamped farther from the next scan was stamped by another clock: it is taken to hold at that scan."""
+MAX_HEADING_AGE_NS = 500_000_000
+"""An older heading of a compass says nothing about a robot that may have turned since."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of one scan."""
+
+    estimate: Estimate
+    is_fault: bool = False
+    """The scan could not be used: it could not be read, or localizing it failed. The estimate has no fix."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedInput:
+    """A scan with what had been measured beside it when it arrived."""
+
+    scan: Scan
+    T_base_lidar: Float64Array
+    """(4, 4) mounting of the lidar."""
+    up_base: Float64Array | None
+    """(3,) unit vector that points up, base frame; None where it is not known."""
+    heading: PosePrior | None
+    """The newest heading of a compass; None where there is none."""
+
+
+class ScanLocalizer(Protocol):
+    """What a session feeds; `localization.localizer.Localizer` is the one that ships."""
+
+    config: LocalizerConfig
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Stamp of the last scan that counted, where the next motion begins; None before the first."""
+
+    def localize(
+        self,
+        scan: Scan,
+        gravity_base: Float64Array | None = None,
+        T_base_lidar: Float64Array | None = None,
+        motion: Motion | Callable[[], Motion | None] | None = None,
+    ) -> Estimate:
+        """Return where a scan was taken."""
+
+    def set_prior(self, prior: PosePrior) -> None:
+        """Take in what is known of the pose from outside."""
+
+    def reset(self) -> None:
+        """Forget every hypothesis."""
+
+    def reconfigure(self, config: LocalizerConfig) -> None:
+        """Use other settings from the next scan on."""
+
+
+class Session:
+    """Feed one localizer with one robot's inputs."""
+
+    def __init__(
+        self, localizer: ScanLocalizer, odometry: OdometryKind = "none", imu_time_constant_s: float = 1.0
+    ) -> None:
+        """Start with nothing received; ConfigError where KISS-ICP is needed and not installed."""
+        self.localizer = localizer
+        self.state = TrackState.SEARCHING
+        """That of the last scan that could change it."""
+        config = localizer.config
+        self._gravity = GravityFilter(imu_time_constant_s)
+        self._heading: PosePrior | None = None
+        self._priors: list[PosePrior] = []
+        self._odometry = OdometryBuffer(config.fusion) if odometry == "topic" else None
+        self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m) if odometry == "scan" else None
+
+    def reset(self) -> None:
+        """Forget the hypotheses, the priors and what the IMU measured: the robot may be anywhere, in any attitude."""
+        self.localizer.reset()
+        self.state = TrackState.SEARCHING
+        self._gravity.reset()
+        self._heading = None
+        self._priors.clear()
+        if self._scan_odometry is not None:
+            self._scan_odometry.reset()
+
+    def reconfigure(self, config: LocalizerConfig) -> None:
+        """Use other settings from the next scan on; hypotheses, priors and the odometry received so far are kept."""
+        self.localizer.reconfigure(config)
+        if self._odometry is not None:
+            self._odometry.reconfigure(config.fusion)
+        if self._scan_odometry is not None:
+            self._scan_odometry.reconfigure(config.fusion, config.scan.max_range_m)
+
+    def add_odometry(self, stamp_ns: int, T_odom_base: Float64Array) -> bool:
+        """Take in a pose (4, 4) of the base in the odometry's frame, and return whether it can be used."""
+        return self._odometry is not None and self._odometry.add(stamp_ns, T_odom_base)
+
+    def add_acceleration(self, stamp_ns: int, acceleration_base: Float64Array) -> bool:
+        """Take in a specific force (3,), m/s2, base frame, +z up at rest; return whether it can be gravity."""
+        return self._gravity.update(stamp_ns, acceleration_base)
+
+    def add_heading(self, heading: PosePrior) -> None:
+        """Take in a compass's heading; it counts for scans of its time while the robot is not localized."""
+        self._heading = heading
+
+    def add_prior(self, prior: PosePrior) -> None:
+        """Take in a pose that is given from outside; it counts from the next scan on."""
+        self._priors.append(prior)
+
+    def odometry_pose(self, stamp_ns: int) -> Float64Array | None:
+        """Return `T_odom_base` (4, 4) at a stamp; None where odometry from a topic does not give it."""
+        return None if self._odometry is None else self._odometry.pose_at(stamp_ns)
+
+    def has_odometry_until(self, stamp_ns: int) -> bool:
+        """Return whether no sample of odometry is missing for a scan of this stamp."""
+        newest_ns = None if self._odometry is None else self._odometry.newest_ns
+        return self._odometry is None or (newest_ns is not None and newest_ns >= stamp_ns)
+
+    def receive(
+        self, scan: Scan, T_base_lidar: Float64Array | None = None, up_base: Float64Array | None = None
+    ) -> PreparedInput:
+        """Take in a scan, register it with the odometry from scan to scan, and note what else is known at its time.
+
+        Each scan is received once, in the order of arrival, whether it will be localized or not. `T_base_lidar` (4, 4)
+        replaces the mounting of the configuration, `up_base` (3,) the accelerations.
+        """
+        config = self.localizer.config.scan
+        mounting = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
+        if self._scan_odometry is not None:
+            ranges = np.linalg.norm(scan.points, axis=1)
+            used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
+            self._scan_odometry.add(scan.stamp_ns, transform_points(mounting, scan.points[used]).astype(np.float64))
+        up = self._gravity.up(scan.stamp_ns) if up_base is None else up_base
+        return PreparedInput(scan, mounting, up, self._heading)
+
+    def localize(self, received: PreparedInput, wait_for_odometry: Callable[[int], None] | None = None) -> Outcome:
+        """Return where a scan was taken; one that cannot be used is an outcome too, with the reason.
+
+        `wait_for_odometry(stamp_ns)` is called when the motion is needed and the odometry of that stamp is missing.
+        """
+        scan, localizer = received.scan, self.localizer
+
+        def motion() -> Motion | None:
+            source = self._odometry or self._scan_odometry
+            if source is None or localizer.stamp_ns is None:
+                return None
+            if wait_for_odometry is not None and not self.has_odometry_until(scan.stamp_ns):
+                wait_for_odometry(scan.stamp_ns)
+            return source.motion(localizer.stamp_ns, scan.stamp_ns)
+
+        try:
+            self._hand_over_priors(received)
+            estimate = localizer.localize(scan, received.up_base, received.T_base_lidar, motion)
+        except CrossLocError as error:
+            return self.fault(scan.stamp_ns, str(error))
+        if not len(estimate.candidates):  # nothing was compared with the map: what was known before still holds
+            estimate = replace(estimate, state=self.state)
+        self.state = estimate.state
+        return Outcome(estimate)
+
+    def fault(self, stamp_ns: int, reason: str) -> Outcome:
+        """Return the outcome of a scan that says nothing: no fix, and the state that it was."""
+        return Outcome(replace(no_estimate(stamp_ns, reason), state=self.state), is_fault=True)
+
+    def _hand_over_priors(self, received: PreparedInput) -> None:
+        stamp_ns = received.scan.stamp_ns
+        for prior in self._priors:
+            same_clock = abs(prior.stamp_ns - stamp_ns) < SAME_CLOCK_NS
+            self.localizer.set_prior(prior if same_clock else replace(prior, stamp_ns=0))
+        self._priors.clear()
+        heading = received.heading
+        if heading is None or self.state is TrackState.LOCALIZED:
+            return
+        if abs(stamp_ns - heading.stamp_ns) <= MAX_HEADING_AGE_NS:
+            self.localizer.set_prior(heading)
