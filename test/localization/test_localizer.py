@@ -28,7 +28,7 @@ from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.alignment.pose_search import wrapped
 from crossloc3d_ros.localization.fusion.odometry import Motion
-from crossloc3d_ros.localization.localizer import Localizer, Looks
+from crossloc3d_ros.localization.localizer import Localizer, SearchSchedule
 from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 
@@ -352,7 +352,7 @@ def test_a_pose_is_that_at_the_stamp_not_in_the_middle_of_the_turn(town: tuple[P
 
 
 def test_looks_are_due_at_once_then_now_and_then() -> None:
-    looks, second = Looks(AlignmentConfig()), 1_000_000_000
+    looks, second = SearchSchedule(AlignmentConfig()), 1_000_000_000
     assert looks.around(0) and looks.everywhere(0)
     assert [looks.around(t * second // 10) for t in range(1, 7)] == [False, False, False, False, True, False]
     assert not looks.everywhere(second // 10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,10 @@ class Listener:
         scan: Scan,
         gravity_base: Float64Array | None = None,
         T_base_lidar: Float64Array | None = None,
-        motion: Motion | None = None,
+        motion: Motion | Callable[[], Motion | None] | None = None,
     ) -> Estimate:
+        self.motions.append(motion() if callable(motion) else motion)
         self.stamps_ns.append(scan.stamp_ns)
-        self.motions.append(motion)
         return no_estimate(scan.stamp_ns, "stand-in")
 
 
@@ -92,7 +93,7 @@ def replayed(path: Path, odometry_topic: str | None = "/odom", **options: Any) -
     listener = Listener()
     source = OdometrySource(odometry_topic)
     with bag.open_bag(path) as reader:
-        localize_bag(reader, "/points", listener, path.parent / "e.csv", odometry=source, **options)  # type: ignore[arg-type]
+        localize_bag(reader, "/points", listener, path.parent / "e.csv", odometry=source, **options)
     return listener
 
 
@@ -135,7 +136,7 @@ def test_without_odometry_nothing_is_told(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive")
     listener = Listener()
     with bag.open_bag(path) as reader:
-        localize_bag(reader, "/points", listener, tmp_path / "e.csv")  # type: ignore[arg-type]
+        localize_bag(reader, "/points", listener, tmp_path / "e.csv")
     assert listener.motions == [None] * 6
 
 
@@ -226,7 +227,7 @@ def test_scans_tell_the_motion_themselves(tmp_path: Path) -> None:
     mounting = MountingConfig(z_m=1.2, yaw_deg=90.0)
     listener = Listener(LocalizerConfig(scan=ScanConfig(mounting=mounting)))
     with bag.open_bag(path) as reader:
-        localize_bag(reader, "/points", listener, tmp_path / "e.csv", every=4, odometry=OdometrySource())  # type: ignore[arg-type]
+        localize_bag(reader, "/points", listener, tmp_path / "e.csv", every=4, odometry=OdometrySource())
     assert len(listener.motions) == 3
     last = listener.motions[-1]
     assert last is not None
@@ -287,7 +288,7 @@ def test_poses_are_held_against_the_true_ones_of_the_recording(town_map: AerialM
         messages.append(("/ground_truth/odom", bag.ODOMETRY, stamp, message))
         messages.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
     with bag.open_bag(record(tmp_path / "drive", messages)) as reader:
-        localize_bag(reader, "/points", Oracle(frame, truth), tmp_path / ESTIMATES)  # type: ignore[arg-type]
+        localize_bag(reader, "/points", Oracle(frame, truth), tmp_path / ESTIMATES)
         evaluation = evaluate(reader, tmp_path, town_map)
     assert evaluation.heading_topic == "/ground_truth/odom"
     np.testing.assert_allclose(np.degrees(evaluation.table.heading_error_rad), 2.0, atol=1e-3)
