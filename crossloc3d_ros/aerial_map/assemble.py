@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -21,6 +20,7 @@ from crossloc3d_ros.aerial_map.tile import TileReport, TileResult, read_result
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.errors import AerialDataError
+from crossloc3d_ros.files import sync
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array
 
 _TILES_IN_MEMORY = 16
@@ -95,7 +95,7 @@ def write_map(
         software=f"crossloc3d_ros {__version__}",
     )
     store.write_manifest(folder, manifest)
-    _to_disk(folder)
+    sync(folder)  # before the rename that publishes it
     return manifest
 
 
@@ -151,13 +151,3 @@ class _TileRasters:
 def _union(bounds: Sequence[Bounds]) -> Bounds:
     west, south, east, north = np.array(bounds).T
     return float(west.min()), float(south.min()), float(east.max()), float(north.max())
-
-
-def _to_disk(folder: Path) -> None:
-    """Wait until the files lie on the disk, so that the rename that publishes them never comes before them."""
-    for path in (*folder.iterdir(), folder):
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import fcntl
 import json
 import logging
 import math
@@ -32,6 +31,7 @@ from crossloc3d_ros.aerial_map.tile import TileReport, TileTask, TileTimes, buil
 from crossloc3d_ros.clouds.tiling import submap_centres
 from crossloc3d_ros.config import BuildConfig, to_dict
 from crossloc3d_ros.errors import AerialDataError, ConfigError, MapError
+from crossloc3d_ros.files import publish, remove_leftovers, restore, size_of, work_lock, write_atomically
 from crossloc3d_ros.formats.las import AerialHeader, expand_inputs, read_header
 from crossloc3d_ros.geodesy import crs_name, crs_text, metres_per_unit, same_crs, utm_crs_of, vertical_reference
 from crossloc3d_ros.types import DescriptorEncoder
@@ -113,7 +113,7 @@ def build_map(
     output = Path(output).absolute()
     _check_config(config)
     loader, encoder = _encoder_and_loader(encoder)
-    _restore(output)
+    restore(output)
     check_output(output, overwrite)
     headers = read_headers(expand_inputs(inputs), crs)
     source_crs = headers[0].crs
@@ -122,7 +122,7 @@ def build_map(
     report = progress or (lambda _: None)
 
     work = work_folder(output)
-    with _disk_full_explained(work, headers, config, encoder), _exclusive(work):
+    with _disk_full_explained(work, headers, config, encoder), work_lock(work, MapError, "build"):
         resumed = _continue_or_start(work, _job(headers, target_crs, config, encoder))
         with open_workers(loader, encoder, config.workers, scheduler, work) as workers:
             started = time.perf_counter()
@@ -143,7 +143,7 @@ def build_map(
             sources=_sources(headers, spooled, tiles),
             advance=_Counter("writing", 0, len(store.DATA_FILES), "files", report),
         )
-        _publish(work / "map", output)
+        publish(work / "map", output)
         written_at = time.perf_counter()
         shutil.rmtree(work, ignore_errors=True)
     return BuildReport(
@@ -251,18 +251,6 @@ def _job(
     }
 
 
-@contextmanager
-def _exclusive(work: Path) -> Iterator[None]:
-    """Keep a second build of the same map away."""
-    work.mkdir(parents=True, exist_ok=True)
-    with (work / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise MapError(f"another build works in {work}; wait for it, or give --output another name") from error
-        yield
-
-
 def _continue_or_start(work: Path, job: dict[str, Any]) -> bool:
     """Say whether the work folder holds a half-done build of the same job; otherwise empty it for a new one."""
     file = work / "job.json"
@@ -272,17 +260,15 @@ def _continue_or_start(work: Path, job: dict[str, Any]) -> bool:
         earlier = None
     if earlier == job:
         _log.info("continuing the build in %s", work)
-        for leftover in (work / "tiles").glob("*.partial"):  # of a process that was killed while it wrote
-            leftover.unlink()
+        remove_leftovers(work / "spool")
+        remove_leftovers(work / "tiles")
         return True
     if earlier is not None:
         changed = sorted(key for key in {*earlier, *job} if earlier.get(key) != job.get(key))
         _log.warning("starting anew: the half-done build in %s has other %s", work, ", ".join(changed))
     for name in ("spool", "tiles", "map"):
         shutil.rmtree(work / name, ignore_errors=True)
-    partial = file.with_suffix(".partial")
-    partial.write_text(json.dumps(job, indent=1), encoding="utf-8")
-    partial.replace(file)
+    write_atomically(file, json.dumps(job, indent=1), MapError)
     return False
 
 
@@ -442,23 +428,6 @@ def _sources(
     return records
 
 
-def _publish(finished: Path, output: Path) -> None:
-    """Put the finished map in its place; at no moment is there half a map under its name."""
-    replaced = output.with_name(f".{output.name}.replaced")
-    shutil.rmtree(replaced, ignore_errors=True)
-    if output.exists():
-        output.rename(replaced)
-    finished.rename(output)
-    shutil.rmtree(replaced, ignore_errors=True)
-
-
-def _restore(output: Path) -> None:
-    """Give a map its name back that lost it because the process was killed just when it was being replaced."""
-    replaced = output.with_name(f".{output.name}.replaced")
-    if replaced.is_dir() and not output.exists():
-        replaced.rename(output)
-
-
 class _Counter:
     """Adds up what the tasks report and passes it on."""
 
@@ -499,7 +468,7 @@ def _disk_full_explained(
     needed = bytes_needed(headers, config, encoder.descriptor_size)
     existing = next(folder for folder in (work, *work.parents) if folder.exists())
     free = shutil.disk_usage(existing).free
-    begun = sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) if work.exists() else 0
+    begun = size_of(work)
     if free + begun < needed:
         raise MapError(
             f"the disk of {existing} has too little room: the build needs about {_size(needed)} there and "

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crossloc3d_ros.clouds.raster import Bounds
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.formats.las import GROUND, HIGH_NOISE, LOW_NOISE, iter_chunks
 from crossloc3d_ros.geodesy import Projection
 from crossloc3d_ros.types import BoolArray, Float64Array, UInt8Array
@@ -27,6 +27,8 @@ POINT_DTYPE = np.dtype([("e", "<f4"), ("n", "<f4"), ("z", "<f4"), ("classificati
 
 TileKey = tuple[int, int]
 """Column and row: the tile reaches from (column, row) times its side to (column + 1, row + 1) times it."""
+
+_REPORT = "report.json"
 
 _CLASSIFIED_SHARE = 1e-3
 """A file whose points are ground to at least this share is taken as classified."""
@@ -75,9 +77,14 @@ def spool_file(task: SpoolTask, advance: Callable[[int], None] | None = None) ->
 
     Noise (classes 7 and 18), withheld points and coordinates off the Earth are dropped and counted.
     """
-    partial = task.folder.with_name(task.folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    with atomic_path(task.folder, None, parents=True) as partial:
+        partial.mkdir()
+        report = _spool_into(partial, task, advance or (lambda _: None))
+        (partial / _REPORT).write_text(json.dumps(dataclasses.asdict(report)), encoding="utf-8")
+    return report
+
+
+def _spool_into(folder: Path, task: SpoolTask, advance: Callable[[int], None]) -> SpoolReport:
     projection = Projection(task.source_crs, task.target_crs, task.vertical_metres_per_unit)
     read = noise = off_earth = ground = 0
     tiles: dict[TileKey, int] = {}
@@ -87,16 +94,15 @@ def spool_file(task: SpoolTask, advance: Callable[[int], None] | None = None) ->
         is_off_earth = np.isnan(points[:, 0]) & ~is_noise
         kept = ~(is_noise | is_off_earth)
         for key, rows in _split(points[kept], chunk.classification[kept], task.tile_m):
-            with (partial / _file_name(key)).open("ab") as file:
+            with (folder / _file_name(key)).open("ab") as file:
                 file.write(rows.tobytes())
             tiles[key] = tiles.get(key, 0) + len(rows)
         read += len(points)
         noise += int(is_noise.sum())
         off_earth += int(is_off_earth.sum())
         ground += int((chunk.classification[kept] == GROUND).sum())
-        if advance is not None:
-            advance(len(points))
-    report = SpoolReport(
+        advance(len(points))
+    return SpoolReport(
         points_in_file=task.point_count,
         points_withheld=task.point_count - read,
         points_noise=noise,
@@ -104,16 +110,12 @@ def spool_file(task: SpoolTask, advance: Callable[[int], None] | None = None) ->
         points_ground=ground,
         tiles=tuple((column, row, count) for (column, row), count in sorted(tiles.items())),
     )
-    (partial / "report.json").write_text(json.dumps(dataclasses.asdict(report)), encoding="utf-8")
-    shutil.rmtree(task.folder, ignore_errors=True)
-    partial.rename(task.folder)
-    return report
 
 
 def read_report(folder: Path) -> SpoolReport | None:
     """Return what reading a file came to in an earlier run, or None where it was not read to its end."""
     try:
-        values = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        values = json.loads((folder / _REPORT).read_text(encoding="utf-8"))
         report = SpoolReport(**{**values, "tiles": tuple((c, r, n) for c, r, n in values["tiles"])})
         for column, row, count in report.tiles:
             if (folder / _file_name((column, row))).stat().st_size != count * POINT_DTYPE.itemsize:

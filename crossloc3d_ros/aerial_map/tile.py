@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import time
 import zipfile
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from crossloc3d_ros.clouds.ground import classify_ground
 from crossloc3d_ros.clouds.raster import Bounds, Raster, lowest_raster, surface_raster, terrain_raster
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.formats.las import GROUND
 from crossloc3d_ros.types import BoolArray, DescriptorEncoder, Float32Array, Float64Array, Patch, UInt8Array
 
@@ -184,21 +184,16 @@ def ground_points(
 
 def write_result(path: Path, result: TileResult) -> None:
     """Write a tile's result; it appears under its name when it is whole."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez(
-                file,
-                report=np.frombuffer(json.dumps(dataclasses.asdict(result.report)).encode(), dtype=np.uint8),
-                submaps=result.submaps,
-                descriptors=result.descriptors,
-                terrain=result.terrain,
-                surface=result.surface,
-                lowest=result.lowest,
-            )
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_path(path, None) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            report=np.frombuffer(json.dumps(dataclasses.asdict(result.report)).encode(), dtype=np.uint8),
+            submaps=result.submaps,
+            descriptors=result.descriptors,
+            terrain=result.terrain,
+            surface=result.surface,
+            lowest=result.lowest,
+        )
 
 
 def read_result(path: Path) -> TileResult:

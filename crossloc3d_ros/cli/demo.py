@@ -27,9 +27,10 @@ from crossloc3d_ros.cli.replay import PAGE, own_version, print_results, remove_r
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import CrossLocError, MapError
-from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, write_atomically
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
 from crossloc3d_ros.evaluation.drives.evaluation import ESTIMATES, evaluate
 from crossloc3d_ros.evaluation.drives.page import About
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.pages.wording import UNKNOWN, degrees, metres, percent

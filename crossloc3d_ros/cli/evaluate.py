@@ -28,7 +28,6 @@ from crossloc3d_ros.datasets.pose_sets import POSE_SETS, open_pose_set
 from crossloc3d_ros.datasets.published import load_evaluation_set
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError, EvaluationError
-from crossloc3d_ros.evaluation.drives.estimates import write_atomically
 from crossloc3d_ros.evaluation.poses import results as pose_results
 from crossloc3d_ros.evaluation.poses.page import write_pose_page
 from crossloc3d_ros.evaluation.poses.predictions import about_of
@@ -53,6 +52,7 @@ from crossloc3d_ros.evaluation.retrieval.results import as_csv, as_json, headlin
 from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
 from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig, verify
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import EncoderLoader
 

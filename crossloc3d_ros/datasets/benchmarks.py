@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -18,6 +17,7 @@ from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, AmsterdamBenchmark
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, join_sets, load_set, read_settings, save_set
 from crossloc3d_ros.datasets.simulated import SIMULATED, SIMULATED_SMALL, BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.errors import ConfigError, EvaluationError
+from crossloc3d_ros.files import lock
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import open_workers
 
@@ -115,17 +115,11 @@ def _open_simulated(
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """Wait until no other process makes the same set; what it has made is found then."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = folder.with_name(f".{folder.name}.lock").open("w")
-    except OSError as error:
-        raise EvaluationError(f"cannot write in {folder.parent}: {error.strerror or error}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            _log.warning("another process makes %s: waiting for it", folder)
-            fcntl.flock(lock, fcntl.LOCK_EX)
+
+    def wait(holder: str) -> None:
+        _log.warning("another process (%s) makes %s: waiting for it", holder, folder)
+
+    with lock(folder.with_name(f".{folder.name}.lock"), EvaluationError, wait):
         yield
 
 

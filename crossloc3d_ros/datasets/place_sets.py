@@ -10,8 +10,6 @@ import functools
 import hashlib
 import json
 import math
-import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import Any, overload
 import numpy as np
 
 from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 MANIFEST = "manifest.json"
@@ -208,11 +207,8 @@ def save_set(folder: Path, evaluation_set: EvaluationSet, settings: Mapping[str,
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / MANIFEST).is_file():
         raise EvaluationError(f"{folder} holds something else than an evaluation set: name another folder")
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    replaced = folder.with_name(f".{folder.name}.{os.getpid()}.replaced")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir(parents=True)
+    with atomic_path(folder, EvaluationError, synced=True, parents=True) as partial:
+        partial.mkdir()
         roles = {}
         for role, places in evaluation_set.places().items():
             _write_places(partial, role, places)
@@ -227,20 +223,7 @@ def save_set(folder: Path, evaluation_set: EvaluationSet, settings: Mapping[str,
             "places": roles,
             "bytes": {path.name: path.stat().st_size for path in sorted(partial.glob("*.npy"))},
         }
-        with (partial / MANIFEST).open("w", encoding="utf-8") as file:
-            file.write(json.dumps(manifest, indent=1) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        if folder.exists():
-            folder.rename(replaced)
-        partial.rename(folder)
-    except OSError as error:
-        if replaced.exists() and not folder.exists():
-            replaced.rename(folder)
-        raise EvaluationError(f"cannot write the set {folder}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(replaced, ignore_errors=True)
+        (partial / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
 def load_set(folder: Path, *, verify: bool = False) -> EvaluationSet:

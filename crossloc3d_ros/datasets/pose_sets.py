@@ -15,8 +15,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,6 +31,7 @@ from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, AmsterdamBenchmark
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
 from crossloc3d_ros.datasets.simulated import SIMULATED, BenchmarkTown, SimulatedBenchmark, raw_scans, sources_digest
 from crossloc3d_ros.errors import ConfigError, EvaluationError
+from crossloc3d_ros.files import atomic_path, write_atomically
 from crossloc3d_ros.simulation import survey, vlp16
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.survey import fly, write_survey
@@ -399,17 +398,9 @@ def _make_map(
 @contextmanager
 def whole(folder: Path) -> Iterator[Path]:
     """Give a folder to write in that takes the name `folder` when all went well, in place of an older one."""
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir(parents=True)
+    with atomic_path(folder, EvaluationError, parents=True) as partial:
+        partial.mkdir()
         yield partial
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.rename(folder)
-    except OSError as error:
-        raise EvaluationError(f"cannot write {folder}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def mark_made(folder: Path, settings: dict[str, Any]) -> None:
@@ -432,9 +423,4 @@ def is_made(folder: Path, settings: dict[str, Any]) -> bool:
 
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    try:
-        partial = folder / f".{MANIFEST}.{os.getpid()}"
-        partial.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-        partial.replace(folder / MANIFEST)
-    except OSError as error:
-        raise EvaluationError(f"cannot write {folder / MANIFEST}: {error.strerror or error}") from error
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1) + "\n", EvaluationError)

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -23,6 +21,7 @@ from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.networks import make_network
 from crossloc3d_ros.encoder.runtime import Encoder
 from crossloc3d_ros.errors import CheckpointError, ConfigError
+from crossloc3d_ros.files import atomic_path
 
 T = TypeVar("T")
 
@@ -74,17 +73,12 @@ def save_checkpoint(
         "model": json.dumps(to_dict(model.config), sort_keys=True),
         "preprocessing": json.dumps(to_dict(preprocessing), sort_keys=True),
     }
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(state, partial, metadata=header)
-        partial.chmod(0o644)  # safetensors keeps them from everybody else, also from the robot's user
-        partial.replace(path)
+        with atomic_path(path, None, parents=True) as partial:
+            save_file(state, partial, metadata=header)
+            partial.chmod(0o644)  # safetensors keeps them from everybody else, also from the robot's user
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; nothing was written") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -52,6 +52,7 @@ from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as Po
 from rosbags.typesys.stores.ros2_jazzy import std_msgs__msg__Header as Header
 
 from crossloc3d_ros.errors import BagError
+from crossloc3d_ros.formats.pointcloud2 import POINT_FIELD_NUMBERS
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +71,6 @@ VELODYNE_POINT = np.dtype(
         "itemsize": 22,
     }
 )
-_POINT_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 # A full disk reaches us as the one or the other, depending on the storage.
 _DISK_ERRORS = (OSError, sqlite3.Error)
@@ -364,7 +364,12 @@ def velodyne_cloud(
 def structured_cloud(stamp_ns: int, frame_id: str, table: npt.NDArray[Any]) -> PointCloud2:
     """Build a PointCloud2, one row high, from a structured array (N,): its fields, offsets and byte order are kept."""
     fields = [
-        PointField(name, int(offset), _POINT_FIELD_TYPES[kind.base.str[1:]], int(np.prod(kind.shape, dtype=int)) or 1)
+        PointField(
+            name,
+            int(offset),
+            POINT_FIELD_NUMBERS[kind.base.newbyteorder("=")],
+            int(np.prod(kind.shape, dtype=int)) or 1,
+        )
         for name, (kind, offset, *_) in _structured_fields(table.dtype).items()
     ]
     big_endian = any(kind.base.str[0] == ">" for kind, *_ in _structured_fields(table.dtype).values())

@@ -9,19 +9,18 @@ validation area, and `dataset.json`.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from crossloc3d_ros.errors import DatasetError
+from crossloc3d_ros.files import atomic_path, write_atomically
 from crossloc3d_ros.formats.plain_pickle import read_plain_pickle
 from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array, UInt8Array
 
@@ -270,8 +269,7 @@ def write_training(
     The file is an ordinary pickle of protocol 2. It is put together of pickles of its parts, so that the negatives,
     half a gigabyte for ten thousand clouds, are never in memory at once.
     """
-
-    def write(file: IO[bytes]) -> None:
+    with atomic_path(path, DatasetError, synced=True) as partial, partial.open("wb") as file:
         file.write(pickle.PROTO + b"\x02" + pickle.EMPTY_DICT + pickle.MARK)
         for row, (positives, negatives) in enumerate(pairs):
             entry = {
@@ -284,15 +282,13 @@ def write_training(
                 file.write(pickle.dumps(part, protocol=2)[2:-1])
         file.write(pickle.SETITEMS + pickle.STOP)
 
-    _write_whole(path, write)
-
 
 def write_database(path: Path, subsets: Sequence[CloudTable]) -> None:
     """Write a database pickle, whole or not at all."""
     content = [
         {row: {"query": clouds.files[row], **_place(clouds, row)} for row in range(len(clouds))} for clouds in subsets
     ]
-    _write_whole(path, lambda file: pickle.dump(content, file, protocol=2))
+    write_atomically(path, pickle.dumps(content, protocol=2), DatasetError, synced=True)
 
 
 def write_queries(path: Path, subsets: Sequence[QueryTable]) -> None:
@@ -305,33 +301,13 @@ def write_queries(path: Path, subsets: Sequence[QueryTable]) -> None:
             entry.update((int(m), [int(i) for i in rows]) for m, rows in neighbours.items())
             entries[row] = entry
         content.append(entries)
-    _write_whole(path, lambda file: pickle.dump(content, file, protocol=2))
+    write_atomically(path, pickle.dumps(content, protocol=2), DatasetError, synced=True)
 
 
 def write_info(folder: Path, info: Mapping[str, Any]) -> None:
     """Write `dataset.json`, whole or not at all."""
     text = json.dumps({"format": INFO_FORMAT, **info}, indent=1, allow_nan=False) + "\n"
-    _write_whole(folder / INFO, lambda file: file.write(text.encode()))
-
-
-def disk_error(path: Path, error: OSError) -> DatasetError:
-    """Return what to say where writing failed."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DatasetError(f"cannot write {path}: the disk is full; make room and give the same command again")
-    return DatasetError(f"cannot write {path}: {error.strerror or error}")
-
-
-def _write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise disk_error(path, error) from error
+    write_atomically(folder / INFO, text, DatasetError, synced=True)
 
 
 def _place(clouds: CloudTable, row: int) -> dict[str, float]:

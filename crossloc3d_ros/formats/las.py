@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import glob as shell_glob
 import logging
-import os
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from crossloc3d_ros.errors import AerialDataError
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.geodesy import crs_text, parse_crs
 from crossloc3d_ros.types import AerialChunk, Float64Array, UInt8Array
 
@@ -159,7 +160,6 @@ class LazWriter:
         version: str = "1.4",
     ) -> None:
         self._path = path
-        self._partial = path.with_name(f".{os.getpid()}.{path.name}")
         self._header = laspy.LasHeader(point_format=point_format, version=version)
         self._header.generating_software = "crossloc3d_ros"
         steps = np.full(3, scale)
@@ -171,20 +171,21 @@ class LazWriter:
         self._header.scales = steps
         self._offset = offset
         self._writer: laspy.LasWriter | None = None
+        self._open_files = ExitStack()
 
     def __enter__(self) -> LazWriter:
+        self._partial = self._open_files.enter_context(atomic_path(self._path, None))
+        self._open_files.push(self._close)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if self._writer is None and kind is None:
-                self._open(np.zeros((1, 3)))
-            if self._writer is not None:
-                self._writer.close()
-            if kind is None:
-                self._partial.replace(self._path)
-        finally:
-            self._partial.unlink(missing_ok=True)
+    def __exit__(self, *raised: Any) -> None:
+        self._open_files.__exit__(*raised)
+
+    def _close(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._writer is None and kind is None:
+            self._open(np.zeros((1, 3)))
+        if self._writer is not None:
+            self._writer.close()
 
     def write(self, points: Float64Array, classification: UInt8Array) -> None:
         """Append points (N, 3) and their classes (N,)."""

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import Float32Array, Scan
 
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy type of each number that `sensor_msgs/PointField` has for a type."""
 _NAMES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}
-_NUMBERS = {np.dtype(code): number for number, code in _TYPES.items()}
+POINT_FIELD_NUMBERS = {np.dtype(code): number for number, code in POINT_FIELD_TYPES.items()}
 
 
 class _Stamp(Protocol):
@@ -128,7 +129,7 @@ def pack_columns(columns: Mapping[str, npt.NDArray[Any]]) -> PackedCloud:
     offset = 0
     for name, column in columns.items():
         dtype = np.asarray(column).dtype.newbyteorder("<")
-        number = _NUMBERS.get(dtype.newbyteorder("="))
+        number = POINT_FIELD_NUMBERS.get(dtype.newbyteorder("="))
         if number is None:
             raise CloudError(f"column '{name}' is {dtype}, which PointCloud2 cannot hold")
         fields.append((name, offset, number, 1))
@@ -153,7 +154,7 @@ def _coordinate(msg: PointCloud2Like, axis: str) -> tuple[int, np.dtype[Any]]:
         raise CloudError(f"field '{axis}' is {kind}; coordinates must be float32 or float64")
     if count > 1:
         raise CloudError(f"field '{axis}' holds {count} values a point; a coordinate is one")
-    return int(field.offset), np.dtype(_TYPES[datatype]).newbyteorder(">" if msg.is_bigendian else "<")
+    return int(field.offset), np.dtype(POINT_FIELD_TYPES[datatype]).newbyteorder(">" if msg.is_bigendian else "<")
 
 
 def _as_bytes(data: Any) -> npt.NDArray[np.uint8]:

@@ -29,6 +29,7 @@ from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation.drives.estimates import EstimateWriter
 from crossloc3d_ros.formats.bag import BagReader, RawMessage
 from crossloc3d_ros.formats.odometry import pose_matrix
+from crossloc3d_ros.formats.pointcloud2 import POINT_FIELD_TYPES
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.ros.conversions import in_grid
@@ -53,7 +54,6 @@ PROGRAM = ("-m", "crossloc3d_ros.cli.localizer")
 _QUIET_S = 3.0
 """The node has answered everything that it will when so long nothing has come."""
 _STOP_S = 15.0
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 class Answer(NamedTuple):
@@ -331,7 +331,7 @@ def _rows(table: PointCloud2 | None) -> npt.NDArray[Any]:
     dtype = np.dtype(
         {
             "names": [field.name for field in table.fields],
-            "formats": [_FIELD_TYPES[field.datatype] for field in table.fields],
+            "formats": [POINT_FIELD_TYPES[field.datatype] for field in table.fields],
             "offsets": [field.offset for field in table.fields],
             "itemsize": table.point_step,
         }

@@ -12,6 +12,8 @@ import tempfile
 from collections.abc import MutableMapping
 from pathlib import Path
 
+from crossloc3d_ros.files import write_atomically
+
 PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _USERS_OWN = (PROFILES_VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE")
 SEGMENT_BYTES = 32 * 1024 * 1024
@@ -68,11 +70,7 @@ def write_profile(path: Path) -> Path:
     """Write the profile to `path`, whole or not at all, and return the path."""
     if path.is_file() and path.read_text(encoding="utf-8") == PROFILE:
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Processes that start together may write together: each its own file, and the rename decides.
-    with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".xml", delete=False) as file:
-        file.write(PROFILE)
-    Path(file.name).replace(path)
+    write_atomically(path, PROFILE, parents=True)  # processes that start together may write together
     return path
 
 

@@ -35,11 +35,11 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
 )
 from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import difference, score
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loop import Progress, Trainer
 from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.schedule import Budget
-from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import EncoderLoader
 
@@ -290,7 +290,8 @@ class Comparison:
         predictions = self._predict(row, encoder, loader)
         write_predictions(folder / PREDICTIONS, predictions)
         result = self._result(row, encoder, predictions)
-        write_text(folder / RESULT, json.dumps({"format": _FORMAT, **to_dict(result)}, indent=1) + "\n")
+        content = json.dumps({"format": _FORMAT, **to_dict(result)}, indent=1) + "\n"
+        write_atomically(folder / RESULT, content, TrainingError, synced=True)
 
     def _train(self, row: Row, config: TrainConfig, folder: Path) -> None:
         """Bring the row's run to the end of the budget; nothing where it is there."""
@@ -303,7 +304,7 @@ class Comparison:
             return
         trainer.run(resume=begun)
         trainer.write_card()
-        write_text(folder / ENDED, self.budget.option() + "\n")
+        write_atomically(folder / ENDED, self.budget.option() + "\n", TrainingError, synced=True)
 
     def _encoder(self, row: Row, folder: Path) -> tuple[DescriptorEncoder, EncoderLoader]:
         if row.config is None:

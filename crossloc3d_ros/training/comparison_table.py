@@ -10,7 +10,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
-from crossloc3d_ros.evaluation.drives.estimates import write_atomically
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training.comparison import RADII_M, RANKS, Result
 
 CSV, MARKDOWN, HTML = "comparison.csv", "comparison.md", "comparison.html"

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
 from crossloc3d_ros.training import run_folder
-from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.types import Float64Array
 
 _RECALLS = (("R@1", 100.0), ("R@1", 50.0), ("R@1", 25.0), ("R@25", 100.0))
@@ -28,7 +28,7 @@ def write_curve(folder: Path, path: Path | None = None, *, live: bool = False) -
     that has not logged anything yet.
     """
     path = path or folder / run_folder.CURVE
-    write_text(path, curve_page(folder, live=live))
+    write_atomically(path, curve_page(folder, live=live))
     return path
 
 

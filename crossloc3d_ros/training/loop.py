@@ -19,6 +19,7 @@ from torch import nn
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.ahead import BatchesAhead
 from crossloc3d_ros.training.curve import write_curve
@@ -31,7 +32,7 @@ from crossloc3d_ros.training.mining import mine
 from crossloc3d_ros.training.model_card import model_card
 from crossloc3d_ros.training.sampling import HardPlaces, Sampler
 from crossloc3d_ros.training.schedule import Budget, learning_rate
-from crossloc3d_ros.training.shards import ValidationTown, write_text
+from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.training.state import RunState, average, grow_batches, new_state
 from crossloc3d_ros.training.validation import Validation, validate
 from crossloc3d_ros.types import Float32Array
@@ -108,7 +109,8 @@ class Trainer:
     def write_card(self) -> Path:
         """Write the model card of the run into its folder and return its path."""
         path = self.folder / run_folder.MODEL_CARD
-        write_text(path, model_card(self.folder, read_material(self.places, preset=self.preset)))
+        card = model_card(self.folder, read_material(self.places, preset=self.preset))
+        write_atomically(path, card, TrainingError, synced=True)
         return path
 
     def _begin(self, initial: Initial | None, *, resume: bool) -> tuple[run_folder.Log, RunState]:
@@ -272,7 +274,7 @@ def write_card(folder: Path, weights: Path, material: Material | None = None, re
         settings = run_folder.read_settings(folder)
         material = read_material([Path(name) for name in settings.places], preset=settings.preset)
     card = weights.parent / run_folder.MODEL_CARD
-    write_text(card, model_card(folder, material, weights=weights, results=results))
+    write_atomically(card, model_card(folder, material, weights=weights, results=results), TrainingError, synced=True)
     return card
 
 

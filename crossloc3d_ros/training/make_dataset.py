@@ -7,7 +7,6 @@ any moment, and the same call goes on. The dataset appears in one rename.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
@@ -15,7 +14,6 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,12 +28,12 @@ from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import BuildConfig, DatasetConfig, PreprocessingConfig, ScanConfig, to_dict
 from crossloc3d_ros.datasets.recordings import RecordedScans, Topics, find_topics, read_scans
 from crossloc3d_ros.errors import DatasetError
+from crossloc3d_ros.files import atomic_path, size_of, work_lock, write_atomically, write_error
 from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.formats.cs_campus3d import (
     PRESETS,
     CloudTable,
     QueryTable,
-    disk_error,
     write_cloud,
     write_database,
     write_info,
@@ -114,10 +112,10 @@ def make_dataset(request: DatasetRequest, progress: Progress | None = None) -> D
     Whatever happens, what is done is kept, and the same call goes on.
     """
     show = progress or (lambda *_: None)
-    _check(request)
     work = request.output.with_name(f"{request.output.name}.build")
     try:
-        with _exclusive(work):
+        with work_lock(work, DatasetError, "process"):
+            _check(request)
             _continue_or_start(work, _job(request))
             aerial = cut_aerial(
                 request.survey, work / "aerial", request.build, request.preprocessing, crs=request.crs,
@@ -127,12 +125,10 @@ def make_dataset(request: DatasetRequest, progress: Progress | None = None) -> D
                 _recorded(work, number, request, aerial.manifest.crs, show) for number in range(len(request.bags))
             ]
             report = _Dataset(request, aerial, recordings).write(work / "dataset", show)
-            if request.output.exists():
-                request.output.rmdir()  # empty: _check has looked
-            (work / "dataset").rename(request.output)
+            (work / "dataset").rename(request.output)  # which does not exist, or is an empty folder
             shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
-        raise disk_error(work, error) from error
+        raise write_error(work, error, DatasetError) from error
     return report
 
 
@@ -236,7 +232,7 @@ class _Dataset:
         scan_rows = np.flatnonzero(np.isin(self.scan_roles, (TRAINING, VALIDATION, TEST)))
         total = len(submap_rows) + len(scan_rows)
         needed = total * self.request.preprocessing.n_points * 24
-        lying = sum(path.stat().st_size for path in folder.rglob("*.bin"))
+        lying = size_of(folder, ".bin")
         free = shutil.disk_usage(folder).free
         if free + lying < 1.02 * needed:
             raise DatasetError(
@@ -400,9 +396,7 @@ def _continue_or_start(work: Path, job: dict[str, Any]) -> None:
             log.warning("starting anew: the half-done work in %s has other %s", work, ", ".join(changed))
     for name in stale:
         shutil.rmtree(work / name, ignore_errors=True)
-    partial = file.with_suffix(".partial")
-    partial.write_text(json.dumps(job), encoding="utf-8")
-    partial.replace(file)
+    write_atomically(file, json.dumps(job), DatasetError)
 
 
 def _recorded(work: Path, number: int, request: DatasetRequest, crs: str, show: Progress) -> tuple[str, RecordedScans]:
@@ -417,17 +411,14 @@ def _recorded(work: Path, number: int, request: DatasetRequest, crs: str, show: 
         path, request.topics, crs, request.scan, request.preprocessing, request.config,
         lambda done, total: show(f"scans {number + 1}", done, total, "scans"),
     )  # fmt: skip
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    partial = kept.with_name(f".{kept.name}.partial")
     about = json.dumps(
         {"seen": scans.seen, "dropped": dict(scans.dropped), "topics": dict(scans.topics), "damage": scans.damage}
     )
-    with partial.open("wb") as file:
+    with atomic_path(kept, DatasetError, parents=True) as partial, partial.open("wb") as file:
         np.savez(
             file, stamp_ns=scans.stamp_ns, xy_m=scans.xy_m, heading_rad=scans.heading_rad, patches=scans.patches,
             about=np.frombuffer(about.encode(), np.uint8),
         )  # fmt: skip
-    partial.replace(kept)
     return name, scans
 
 
@@ -438,17 +429,3 @@ def _read_kept(path: Path) -> RecordedScans | None:
             return RecordedScans(file["stamp_ns"], file["xy_m"], file["heading_rad"], file["patches"], **about)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-
-
-@contextmanager
-def _exclusive(work: Path) -> Iterator[None]:
-    """Keep a second process away from the same work."""
-    work.mkdir(parents=True, exist_ok=True)
-    with (work / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DatasetError(
-                f"another process works in {work}; wait for it, or give --output another name"
-            ) from error
-        yield

@@ -21,9 +21,9 @@ from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.checkpoint import save_checkpoint
 from crossloc3d_ros.encoder.runtime import stored_calibration
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.files import atomic_path, remove_leftovers, write_atomically
 from crossloc3d_ros.training.initial import HISTORY, Initial, read_initial
 from crossloc3d_ros.training.material import Material
-from crossloc3d_ros.training.shards import write_text
 from crossloc3d_ros.training.validation import QUANTILES, Validation
 
 SETTINGS = "run.json"
@@ -76,11 +76,10 @@ def prepare(
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise TrainingError(f"cannot make {folder}: {error.strerror or error}") from error
-        write_text(path, json.dumps(asdict(settings), indent=1) + "\n")
+        write_atomically(path, json.dumps(asdict(settings), indent=1) + "\n", TrainingError, synced=True)
         return initial
     before = check(folder, config, material)
-    for leftover in folder.glob(".*.partial"):
-        leftover.unlink(missing_ok=True)
+    remove_leftovers(folder)
     if noted is not None and (before.initial or {}).get("fingerprint") != noted["fingerprint"]:
         raise TrainingError(f"the run in {folder} began with other weights; resume it without --initial")
     if initial is None and before.initial is not None and not (folder / STATE).exists():
@@ -136,15 +135,10 @@ def history(folder: Path) -> list[dict[str, Any]]:
 
 def save_state(folder: Path, state: dict[str, Any]) -> None:
     """Write the state, whole or not at all."""
-    partial = folder / f".{STATE}.partial"
     try:
-        with partial.open("wb") as file:
+        with atomic_path(folder / STATE, None, synced=True) as partial, partial.open("wb") as file:
             torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(folder / STATE)
     except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
-        partial.unlink(missing_ok=True)
         reason = error.__context__ if isinstance(error.__context__, OSError) else error
         raise TrainingError(
             f"cannot write the state of the run into {folder}: {reason}; the one before is kept, go on by `--resume`"
@@ -171,7 +165,7 @@ class Log:
         self._path = folder / LOG
         lines = [json.dumps(entry) for entry in read_log(folder) if entry["step"] <= step]
         if lines or self._path.exists():
-            write_text(self._path, "".join(f"{line}\n" for line in lines))
+            write_atomically(self._path, "".join(f"{line}\n" for line in lines), TrainingError, synced=True)
 
     def write(self, kind: str, **values: Any) -> None:
         """Append one entry."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.files import atomic_path, write_atomically
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 MANIFEST = "manifest.json"
@@ -94,14 +94,8 @@ class Manifest:
 def write_town(path: Path, town: TrainingTown | ValidationTown) -> None:
     """Write one town, whole or not at all."""
     arrays: dict[str, Any] = {key: value for key, value in vars(town).items() if isinstance(value, np.ndarray)}
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez(file, **arrays)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
+    with atomic_path(path, TrainingError) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def read_training_town(path: Path) -> TrainingTown:
@@ -123,7 +117,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         "settings": dict(manifest.settings),
         "towns": [vars(town) for town in manifest.towns],
     }
-    write_text(folder / MANIFEST, json.dumps(content, indent=1) + "\n")
+    write_atomically(folder / MANIFEST, json.dumps(content, indent=1) + "\n", TrainingError, synced=True)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -138,20 +132,6 @@ def read_manifest(folder: Path) -> Manifest:
         raise TrainingError(f"{folder} holds no training places; make them with `train make-places`") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{path} is damaged ({error}): make the places anew") from error
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with partial.open("w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, Any]:

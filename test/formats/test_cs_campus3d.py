@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from crossloc3d_ros import files
 from crossloc3d_ros.errors import DatasetError
-from crossloc3d_ros.formats import cs_campus3d
 from crossloc3d_ros.formats.cs_campus3d import (
     PRESETS,
     CloudTable,
@@ -254,7 +254,7 @@ def test_a_full_disk_leaves_the_older_file(tmp_path: Path, monkeypatch: pytest.M
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(cs_campus3d.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(DatasetError, match="the disk is full; make room"):
         write_database(path, [clouds, clouds])
     assert path.read_bytes() == before

@@ -194,7 +194,7 @@ def test_odometry_of_another_frame_is_used_and_said(tmp_path: Path, caplog: pyte
     ]
     messages.append(("/points", bag.POINT_CLOUD, START + 1, cloud(START + 1)))
     replayed(record(tmp_path / "drive", messages))
-    assert caplog.text.count("tells the pose of 'base_footprint'") == 1
+    assert caplog.text.count("gives the pose of 'base_footprint'") == 1
 
 
 def test_of_a_damaged_recording_the_scans_that_wait_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from crossloc3d_ros.config import (
 from crossloc3d_ros.datasets.published import load_evaluation_set
 from crossloc3d_ros.datasets.recordings import Topics
 from crossloc3d_ros.errors import AerialDataError, BagError, DatasetError, TrainingError
+from crossloc3d_ros.files import work_lock
 from crossloc3d_ros.formats import cs_campus3d
 from crossloc3d_ros.formats.cs_campus3d import PRESETS, read_evaluation, read_info, read_training
 from crossloc3d_ros.training import make_dataset as module
@@ -269,7 +270,7 @@ def test_what_can_be_refused_is_refused_at_once(recorded_area, tmp_path: Path, m
 
 def test_two_calls_do_not_work_in_one_folder(recorded_area, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     with (
-        module._exclusive(tmp_path / "own.build"),
+        work_lock(tmp_path / "own.build", DatasetError, "process"),
         pytest.raises(DatasetError, match=r"another process works in .*own\.build"),
     ):
         make_dataset(request_of(recorded_area, tmp_path / "own"))

@@ -21,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 
 from crossloc3d_ros.errors import CrossLocError
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import (
     EXHAUSTIVE,
@@ -401,18 +402,6 @@ def wrapped(angle_rad: Float64Array) -> Float64Array:
 def heading_of(T_map_base: Float64Array) -> float:
     """Return the heading of a pose (4, 4), counter-clockwise from the x axis of its frame, radians; NaN of none."""
     return math.atan2(T_map_base[1, 0], T_map_base[0, 0])
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that it is there as a whole or not at all; CrossLocError where it cannot be."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise CrossLocError(f"cannot write {path}: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _table(rows: Sequence[dict[str, str]]) -> EstimateTable:

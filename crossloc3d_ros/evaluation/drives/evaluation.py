@@ -17,11 +17,11 @@ from crossloc3d_ros.evaluation.drives.estimates import (
     EstimateTable,
     add_truth,
     read_estimates,
-    write_atomically,
     write_geojson,
 )
 from crossloc3d_ros.evaluation.drives.track_scores import TrackScores, score_track
 from crossloc3d_ros.evaluation.recall import Scores, score
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.formats.bag import BagReader
 
 log = logging.getLogger(__name__)

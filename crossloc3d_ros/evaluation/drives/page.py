@@ -15,11 +15,12 @@ import numpy as np
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.datasets.truth import TruthTrack
 from crossloc3d_ros.evaluation.drives import charts as replay_charts
-from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, wrapped, write_atomically
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, wrapped
 from crossloc3d_ros.evaluation.drives.evaluation import Evaluation
 from crossloc3d_ros.evaluation.drives.page_map import draw_map, grid_turn_rad, legend, page_data
 from crossloc3d_ros.evaluation.drives.track_scores import CARRIED, FROM_NOTHING, LOST, WRONG_M, Search, TrackScores
 from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS, Scores, horizontal_distances
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.pages.backdrop import draw_backdrop
 from crossloc3d_ros.pages.wording import count, degrees, finite, interval, metres, percent

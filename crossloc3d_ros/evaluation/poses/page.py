@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from crossloc3d_ros.evaluation.drives.estimates import write_atomically
 from crossloc3d_ros.evaluation.poses.results import interval_of, shown, wanted
 from crossloc3d_ros.evaluation.poses.scores import (
     AMONG_M,
@@ -25,6 +24,7 @@ from crossloc3d_ros.evaluation.poses.scores import (
     expected_inside,
     verdicts,
 )
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
 
 _MARKS = {"goal": ("✓ goal", "right"), "floor": ("– floor", "fair"), "below": ("✗ below", "miss"), "": ("", "")}

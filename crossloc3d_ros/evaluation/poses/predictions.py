@@ -20,6 +20,7 @@ from crossloc3d_ros.datasets.pose_drives import Journey, RawDrive, load_drives, 
 from crossloc3d_ros.datasets.pose_sets import PoseSet, Progress, load_pose_set
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import OdometryKind, ScanLocalizer, Session
@@ -366,17 +367,9 @@ def about_of(
 
 def save_predictions(path: Path, predictions: PosePredictions, about: PoseAbout) -> None:
     """Write predictions to one file, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
     text = json.dumps({"format": FORMAT, **dataclasses.asdict(about)})
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            np.savez_compressed(file, about=np.array(text), **{name: getattr(predictions, name) for name in _columns()})
-        partial.replace(path)
-    except OSError as error:
-        raise EvaluationError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_path(path, EvaluationError, parents=True) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, about=np.array(text), **{name: getattr(predictions, name) for name in _columns()})
 
 
 def load_predictions(path: Path) -> tuple[PosePredictions, PoseAbout]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.datasets.place_sets import PlaceSet
 from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array
 from crossloc3d_ros.workers import EncoderLoader, open_workers
 
@@ -148,13 +148,8 @@ def _encode_chunk(chunk: _Chunk, encoder: DescriptorEncoder, advance: Callable[[
     descriptors = np.concatenate(parts).reshape(*chunk.angles_rad.shape, -1).astype(np.float32, copy=False)
     if not np.isfinite(descriptors).all():
         raise EvaluationError("the encoder gave descriptors that are not finite: are these weights damaged?")
-    partial = chunk.path.with_name(f".{chunk.path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            np.save(file, descriptors, allow_pickle=False)
-        partial.replace(chunk.path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_path(chunk.path, None) as partial, partial.open("wb") as file:
+        np.save(file, descriptors, allow_pickle=False)
     if advance is not None:
         advance(len(chunk.clouds))
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from crossloc3d_ros.evaluation.drives.estimates import write_atomically
 from crossloc3d_ros.evaluation.retrieval.gallery import TOP, Picture, Row
 from crossloc3d_ros.evaluation.retrieval.predictions import About
 from crossloc3d_ros.evaluation.retrieval.results import label_of
 from crossloc3d_ros.evaluation.retrieval.scores import CURVE, RADII_M, Figure, GroupScores, Scores
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
 
 _MOST_LINES = 8

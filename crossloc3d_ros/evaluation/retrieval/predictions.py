@@ -27,6 +27,7 @@ from crossloc3d_ros.evaluation.retrieval.encoding import (
     north_angles,
     time_queries,
 )
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.localization.retrieval.candidates import heading_angles
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array, HeadingEncoder, Int64Array
 
@@ -290,15 +291,7 @@ def save_predictions(path: Path, predictions: Predictions) -> None:
         headings=predictions.headings.astype(np.int16),
         **{name: values for name in _OF_FITS if (values := getattr(predictions, name)) is not None},
     )
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(buffer.getvalue())
-        partial.replace(path)
-    except OSError as error:
-        raise EvaluationError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    write_atomically(path, buffer.getvalue(), EvaluationError, parents=True)
 
 
 def load_predictions(path: Path) -> Predictions:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crossloc3d_ros import files
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation.drives import estimates
 from crossloc3d_ros.geodesy import MapFrame
@@ -297,19 +298,19 @@ def test_foreign_and_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(CrossLocError, match="cannot write"), estimates.EstimateWriter(path / "below" / "e.csv"):
         pass
     with pytest.raises(CrossLocError, match="cannot write"):
-        estimates.write_atomically(tmp_path / "no" / "such" / "folder.txt", "text")
+        files.write_atomically(tmp_path / "no" / "such" / "folder.txt", "text")
 
 
 def test_a_full_disk_is_said_and_the_old_file_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "page.html"
-    estimates.write_atomically(path, "old")
+    files.write_atomically(path, "old")
 
     def full(self: Path, *arguments: object, **options: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(CrossLocError, match=r"cannot write .*page\.html.*No space left"):
-        estimates.write_atomically(path, "new")
+        files.write_atomically(path, "new")
     monkeypatch.undo()
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
