@@ -3,10 +3,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-TORCH ?= torch==2.13.0
 # The CPU build of torch; without this index pip takes several gigabytes of CUDA along.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip --disable-pip-version-check
+# Results depend on some dependencies' versions; a robot's install need not hold them.
+INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
 .PHONY: help setup demo test test-all lint bench colcon clean
 
@@ -19,12 +20,12 @@ help:
 
 setup: $(VENV)/.ready
 
-$(VENV)/.ready: setup.py
+$(VENV)/.ready: setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed, $(PYTHON) is older; try: make PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "Python's venv is missing; try: sudo apt-get install python3-venv"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -c 'import torch' 2>/dev/null || $(PIP) install --quiet --retries 1 --timeout 15 --extra-index-url $(TORCH_INDEX) '$(TORCH)'
-	$(PIP) install --quiet --editable '.[ros,odometry,cluster,test]'
+	$(INSTALL) --retries 1 --timeout 15 --extra-index-url $(TORCH_INDEX) torch
+	$(INSTALL) --editable '.[ros,odometry,cluster,test]'
 	touch $@
 
 demo: setup

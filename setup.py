@@ -101,6 +101,7 @@ setup(
             "hypothesis>=6",
             "import-linter>=2",
             "mypy>=1.10",
+            "packaging>=23",
             "pytest>=8",
             "pytest-timeout>=2",
             "ruff>=0.6",

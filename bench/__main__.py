@@ -119,13 +119,8 @@ def _encoding(name: str, clouds: list[Any], encoder: Encoder, peak: float, runs:
 
 
 def bench_golden(encoder: Encoder, peak: float, runs: int) -> list[Figure]:
-    """Time the published network's densest reference cloud, where the reference data is at hand."""
-    shared = Path(os.environ.get("CROSSLOC3D_SHARED", Path(__file__).resolve().parents[2] / "shared"))
-    path = shared / "reference" / "golden_descriptors.npz"
-    if not path.is_file():
-        console().print(f"{path} is not at hand: the golden cloud is left out")
-        return []
-    cloud = np.load(path)["clouds"][0]
+    """Time the published network's densest golden cloud."""
+    cloud = np.load(Path(__file__).resolve().parents[1] / "test/encoder/golden/golden_descriptors.npz")["clouds"][0]
     return [_encoding("published network: golden cloud campus_ground", [cloud], encoder, peak, runs, "30, goal 15")]
 
 

@@ -20,7 +20,7 @@ from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.cli.replay import own_version
-from crossloc3d_ros.config import LocalizerConfig, from_dict
+from crossloc3d_ros.config import LocalizerConfig, VerificationConfig, from_dict
 from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark
 from crossloc3d_ros.datasets.place_sets import EvaluationSet
 from crossloc3d_ros.datasets.pose_drives import journeys_of, open_drives
@@ -51,7 +51,7 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
 from crossloc3d_ros.evaluation.retrieval.results import as_csv, as_json, headline
 from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
-from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig, verify
+from crossloc3d_ros.evaluation.retrieval.verification import verify
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import EncoderLoader

@@ -29,7 +29,7 @@ from crossloc3d_ros.cli.common import (
     run,
     set_up_logging,
 )
-from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig, from_dict
+from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig, PlayerConfig, from_dict
 from crossloc3d_ros.datasets.truth import find_truth_topic
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
@@ -397,7 +397,7 @@ def _publish(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> Non
     target = console()
     set_up_logging(arguments.verbose, target)
     try:
-        from crossloc3d_ros.ros.player import PlayerConfig, play_bag
+        from crossloc3d_ros.ros.player import play_bag
     except ImportError as error:
         raise CrossLocError(
             f"ROS 2 was not found ({error}): source /opt/ros/jazzy/setup.bash, or pip install ros-jazzy-rclpy "

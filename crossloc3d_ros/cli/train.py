@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from crossloc3d_ros.cli import common
-from crossloc3d_ros.config import PlacesConfig, TrainConfig, from_dict
+from crossloc3d_ros.config import PlacesConfig, TrainConfig, VerificationConfig, from_dict
 from crossloc3d_ros.errors import ConfigError
 
 
@@ -143,7 +143,6 @@ def _verification(arguments: argparse.Namespace) -> int:
 
     from crossloc3d_ros.encoder.checkpoint import load_encoder
     from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
-    from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig
     from crossloc3d_ros.training.material import read_material
     from crossloc3d_ros.training.verification import RADII_M, fit_verification
 

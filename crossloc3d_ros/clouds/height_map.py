@@ -18,14 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from crossloc3d_ros.config import option
+from crossloc3d_ros.config import HeightMapConfig
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
@@ -34,19 +33,6 @@ SENSOR_M = 1.2
 _BLOCK_CELLS = 1 << 25
 
 Complex64Array = npt.NDArray[np.complex64]
-
-
-@dataclass(frozen=True)
-class HeightMapConfig:
-    """How height maps are made and compared."""
-
-    cells: int = option(64, "cells along a side of the raster", low=4, high=1000)
-    rings: int = option(20, "rings from a centre out to half the patch's side", low=1, high=200)
-    sectors: int = option(60, "sectors of the full circle: 60 = headings in steps of 6 degrees", low=4, high=720)
-    reach: int = option(2, "centres tried on either side of the robot along both axes: 2 = 25", low=0, high=10)
-    step_m: float = option(3.5, "distance between neighbouring centres", low=0.1, high=50.0)
-    top_deg: float = option(15.0, "the sensor's highest beam above the horizon", low=0.0, high=89.0)
-    smooth: int = option(1, "cells on either side that the survey's map is smoothed over", low=0, high=10)
 
 
 class Match(NamedTuple):

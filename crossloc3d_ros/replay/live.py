@@ -25,6 +25,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import NavSatFix, NavSatStatus, PointCloud2
 
+from crossloc3d_ros.config import PlayerConfig
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation.drives.estimates import EstimateWriter
 from crossloc3d_ros.formats.bag import BagReader, RawMessage
@@ -33,7 +34,7 @@ from crossloc3d_ros.formats.pointcloud2 import POINT_FIELD_TYPES
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.ros.conversions import in_grid
-from crossloc3d_ros.ros.player import Player, PlayerConfig, PlayReport
+from crossloc3d_ros.ros.player import Player, PlayReport
 from crossloc3d_ros.ros.shared_memory import prepare_for_large_clouds
 from crossloc3d_ros.types import (
     AlignedPoses,

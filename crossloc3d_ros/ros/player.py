@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from crossloc3d_ros.config import option
+from crossloc3d_ros.config import PlayerConfig
 from crossloc3d_ros.errors import BagError, CrossLocError
 from crossloc3d_ros.formats.bag import POINT_CLOUD, BagReader, BagTopic, RawMessage
 from crossloc3d_ros.ros.shared_memory import prepare_for_large_clouds
@@ -36,17 +36,6 @@ _MESSAGE_TYPE = re.compile(r"([a-z]\w*)/msg/([A-Z]\w*)")
 _LATE_MS = 100.0
 _ACKNOWLEDGED_WITHIN_S = 2.0
 _SETTLE_S = 0.5
-
-
-@dataclass(frozen=True)
-class PlayerConfig:
-    """How a recording is played."""
-
-    rate: float = option(1.0, "speed: 2 = twice as fast as recorded", low=0.01, high=100.0)
-    clock: bool = option(False, "publish /clock, for nodes with use_sim_time")
-    clock_hz: float = option(100.0, "how often, in real time", low=40.0, high=1000.0)
-    loop: bool = option(False, "start again at the end, until interrupted")
-    wait_s: float = option(30.0, "wait so long for a subscriber of the clouds; 0 = do not wait", low=0.0, high=3600.0)
 
 
 @dataclass(frozen=True)

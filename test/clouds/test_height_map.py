@@ -9,13 +9,12 @@ import pytest
 
 from crossloc3d_ros.clouds.height_map import (
     SENSOR_M,
-    HeightMapConfig,
     HeightMatcher,
     height_raster,
     known_cells,
     polar_maxima,
 )
-from crossloc3d_ros.config import from_dict
+from crossloc3d_ros.config import HeightMapConfig, from_dict
 from crossloc3d_ros.errors import CloudError, ConfigError
 from crossloc3d_ros.types import Float32Array
 

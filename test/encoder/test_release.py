@@ -13,9 +13,13 @@ import pytest
 import torch
 
 from crossloc3d_ros.config import ModelConfig
+from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CAMPUS, CrossLoc3D
 from crossloc3d_ros.encoder.release import from_release, read_release, release_aliases, release_names
+from crossloc3d_ros.encoder.sparse import voxelize
 from crossloc3d_ros.errors import CheckpointError
+
+GOLDEN = Path(__file__).with_name("golden")
 
 
 def fan_in(key: str, shape: tuple[int, ...]) -> int:
@@ -62,21 +66,21 @@ def golden_state(keys_file: Path, statistics_file: Path) -> dict[str, torch.Tens
 
 
 @pytest.fixture(scope="module")
-def state(shared: Any) -> dict[str, torch.Tensor]:
-    return golden_state(shared("reference/state_dict_keys.tsv"), shared("reference/golden_batchnorm_stats.npz"))
+def state() -> dict[str, torch.Tensor]:
+    return golden_state(GOLDEN / "state_dict_keys.tsv", GOLDEN / "golden_batchnorm_stats.npz")
 
 
 @pytest.fixture(scope="module")
-def golden(shared: Any) -> Any:
-    return np.load(shared("reference/golden_descriptors.npz"))
+def golden() -> Any:
+    return np.load(GOLDEN / "golden_descriptors.npz")
 
 
 def test_parameter_count_is_the_published_one() -> None:
     assert sum(p.numel() for p in CrossLoc3D(CAMPUS).parameters()) == 15_348_401
 
 
-def test_names_cover_the_release(shared: Any) -> None:
-    rows = list(csv.DictReader(shared("reference/state_dict_keys.tsv").open(), delimiter="\t"))
+def test_names_cover_the_release() -> None:
+    rows = list(csv.DictReader((GOLDEN / "state_dict_keys.tsv").open(), delimiter="\t"))
     assert len(rows) == 701
     assert {r["key"] for r in rows if r["alias_of_lst2"] == "0"} == set(release_names(CAMPUS).values())
     assert {r["key"] for r in rows if r["alias_of_lst2"] == "1"} == set(release_aliases(CAMPUS))
@@ -89,6 +93,19 @@ def test_model_gives_the_golden_descriptors(state: dict[str, torch.Tensor], gold
         with torch.no_grad():
             descriptor = model([torch.from_numpy(cloud)])[0].numpy()
         assert np.abs(descriptor - expected).max() < 1e-4, name
+
+
+def test_compiled_model_gives_the_golden_descriptors(state: dict[str, torch.Tensor], golden: Any) -> None:
+    model = CompiledModel(from_release(state))
+    for name, cloud, expected in zip(golden["names"], golden["clouds"], golden["descriptors"], strict=True):
+        assert np.abs(model.encode(cloud) - expected).max() < 1e-4, name
+
+
+def test_voxels_are_the_golden_ones(golden: Any) -> None:
+    for cloud, fine, coarse in zip(golden["clouds"], golden["voxels"], golden["voxels_stride2"], strict=True):
+        grids = [voxelize([torch.from_numpy(cloud)], size) for size in CAMPUS.voxel_sizes]
+        assert [len(grid.coords) for grid in grids] == fine.tolist()
+        assert [len(grid.downsample().coords) for grid in grids] == coarse.tolist()
 
 
 def test_model_in_float64_agrees_with_the_float64_reference(state: dict[str, torch.Tensor], golden: Any) -> None:

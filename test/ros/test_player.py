@@ -105,8 +105,9 @@ def heard_by(process: subprocess.Popen[str]) -> dict[str, list]:
 def player_process(path: Path, code: str) -> subprocess.Popen[str]:
     """Play in a process of its own: the Fast DDS profile has to be set before anything else of ROS has started."""
     script = (
+        "from crossloc3d_ros.config import PlayerConfig\n"
         "from crossloc3d_ros.formats.bag import open_bag\n"
-        "from crossloc3d_ros.ros.player import PlayerConfig, play_bag\n"
+        "from crossloc3d_ros.ros.player import play_bag\n"
         f"with open_bag({str(path)!r}) as reader:\n    report = {code}\n"
         "print(report.messages, report.late_median_ms, report.late_p99_ms, report.duration_s)\n"
     )
@@ -234,7 +235,8 @@ def test_what_cannot_be_played_is_said(tmp_path: Path, own_domain: None) -> None
     import rclpy
     from rclpy.node import Node
 
-    from crossloc3d_ros.ros.player import Player, PlayerConfig
+    from crossloc3d_ros.config import PlayerConfig
+    from crossloc3d_ros.ros.player import Player
 
     path = write_drive(tmp_path / "drive", scans=1, points=10)
     context = rclpy.Context()

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from crossloc3d_ros.clouds.height_map import HeightMapConfig, HeightMatcher, Match, height_raster, polar_maxima
-from crossloc3d_ros.config import PreprocessingConfig, to_dict
+from crossloc3d_ros.clouds.height_map import HeightMatcher, Match, height_raster, polar_maxima
+from crossloc3d_ros.config import HeightMapConfig, PreprocessingConfig, to_dict
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from crossloc3d_ros.clouds.height_map import HeightMapConfig
+from crossloc3d_ros.config import HeightMapConfig
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.evaluation.recall import Share, hits, independent_places, wilson_share
 from crossloc3d_ros.evaluation.retrieval.predictions import (

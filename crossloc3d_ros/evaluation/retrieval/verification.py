@@ -18,14 +18,13 @@ import dataclasses
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from crossloc3d_ros.clouds.height_map import Complex64Array, HeightMapConfig, HeightMatcher, height_raster
+from crossloc3d_ros.clouds.height_map import Complex64Array, HeightMatcher, height_raster
 from crossloc3d_ros.clouds.patch import turn
-from crossloc3d_ros.config import option
+from crossloc3d_ros.config import HeightMapConfig, VerificationConfig
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.evaluation.retrieval.encoding import north_angles
@@ -37,14 +36,6 @@ _BLOCK = 256
 _TIMED_QUERIES = 15
 
 Progress = Callable[[str, float, float, str], None]
-
-
-@dataclass(frozen=True)
-class VerificationConfig:
-    """How many answers are looked at again, and how far each distance counts."""
-
-    candidates: int = option(300, "first answers of a query that are compared by height maps", low=1, high=100_000)
-    weight: float = option(293.0, "of the height maps' distance; the descriptors' counts once", low=0.0, high=1e6)
 
 
 class Fits(NamedTuple):

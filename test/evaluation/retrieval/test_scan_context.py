@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.height_map import HeightMapConfig
-from crossloc3d_ros.config import PreprocessingConfig
+from crossloc3d_ros.config import HeightMapConfig, PreprocessingConfig
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.evaluation.retrieval.encoding import OwnDistance
 from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.height_map import HeightMapConfig, HeightMatcher, height_raster
+from crossloc3d_ros.clouds.height_map import HeightMatcher, height_raster
 from crossloc3d_ros.clouds.patch import turn
-from crossloc3d_ros.config import CalibrationConfig, PreprocessingConfig, from_dict
+from crossloc3d_ros.config import CalibrationConfig, HeightMapConfig, PreprocessingConfig, VerificationConfig, from_dict
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.evaluation.retrieval.page import describe, describe_briefly
 from crossloc3d_ros.evaluation.retrieval.predictions import About, Predictions, load_predictions, save_predictions
 from crossloc3d_ros.evaluation.retrieval.results import as_csv, headline
 from crossloc3d_ros.evaluation.retrieval.scores import score
-from crossloc3d_ros.evaluation.retrieval.verification import VerificationConfig, verify
+from crossloc3d_ros.evaluation.retrieval.verification import verify
 
 HALF_M, TEMPERATURE = 50.0, 0.5
 PLACES, QUERIES, KEPT = 30, 12, 24
