@@ -65,7 +65,7 @@ setup(
     maintainer="crossloc3d_ros maintainers",
     maintainer_email="maintainers@crossloc3d.org",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "weights/*", "pages/assets/*"]},
+    package_data={NAME: ["py.typed", "weights/*", "pages/assets/*", "pages/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -77,6 +77,7 @@ setup(
     install_requires=[
         "embreex>=2.17",
         "faiss-cpu>=1.8",
+        "jinja2>=3.1",
         "laspy[lazrs]>=2.5",
         "numba>=0.60",
         "numpy>=1.26",

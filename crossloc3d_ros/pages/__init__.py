@@ -1,1 +1,1 @@
-"""Figures as text, charts as SVG, templates as self-contained HTML."""
+"""Figures as text, charts as SVG, self-contained HTML pages from templates."""

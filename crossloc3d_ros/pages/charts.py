@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+from markupsafe import Markup
 
 from crossloc3d_ros.types import Float64Array
 
@@ -56,8 +57,11 @@ class Chart:
         """Return the pixel of a value along y."""
         return self.height - self.foot - self.y.share(value) * (self.height - _TOP - self.foot)
 
-    def render(self, marks: Sequence[str], identity: str = "", css: str = "") -> str:
-        """Return the chart as an SVG element with `marks` inside its axes, and classes `css` besides `chart`."""
+    def render(self, marks: Sequence[str], identity: str = "", css: str = "") -> Markup:
+        """Return the chart as an SVG element with `marks` inside its axes, and classes `css` besides `chart`.
+
+        `marks` are what the other methods return. All text in it is escaped here, so that pages take it as it is.
+        """
         bottom, right = self.height - self.foot, self.width - _RIGHT
         classes = escape(f"chart {css}".rstrip())
         parts = [
@@ -90,7 +94,7 @@ class Chart:
                 f'<text class="label" x="14" y="{middle:g}" text-anchor="middle" transform="rotate(-90 14 {middle:g})">'
                 f"{escape(self.y.label)}</text>"
             )
-        return "".join([*parts, *marks, "</svg>"])
+        return Markup("".join([*parts, *marks, "</svg>"]))
 
     def line(self, xs: Float64Array, ys: Float64Array, css: str) -> str:
         """Draw a line through points, broken where one is not finite."""

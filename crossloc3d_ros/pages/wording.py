@@ -11,16 +11,35 @@ if TYPE_CHECKING:
 UNKNOWN = "–"
 
 
-def percent(share: float) -> str:
-    """Return a share as per cent, with one decimal where it is small, or so near to 1 that rounding would hide it."""
+def percent(share: float, digits: int | None = None) -> str:
+    """Return a share as per cent, with as many decimals.
+
+    By default with one where it is small, or so near to 1 that rounding would hide it.
+    """
     if not math.isfinite(share):
         return UNKNOWN
     value = 100 * share
+    if digits is not None:
+        return f"{value:.{digits}f} %"
     if 0 < value < 0.1:
         return f"{value:.2f} %"
     if value in (0, 100) or 10 <= value < 99.5:
         return f"{value:.0f} %"
     return f"{min(value, 99.9):.1f} %" if value > 10 else f"{value:.1f} %"
+
+
+def fine_percent(share: float) -> str:
+    """Return a share as per cent with one decimal, near to 1 with two."""
+    if share in (0.0, 1.0):
+        return percent(share)
+    return percent(share, 1) if not share >= 0.9995 else percent(min(share, 0.9999), 2)
+
+
+def percent_range(low: float, high: float) -> str:
+    """Return a range of shares as per cent."""
+    if low <= 0.0:
+        return f"< {100 * high:g} %"
+    return f"≥ {100 * low:g} %" if high >= 1.0 else f"{100 * low:g}–{100 * high:g} %"
 
 
 def metres(value: float) -> str:
@@ -42,6 +61,11 @@ def degrees(value: float) -> str:
 def interval(share: Share) -> str:
     """Return the interval of a share."""
     return f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+
+
+def number(value: float, digits: int = 0) -> str:
+    """Return a number with as many decimals and commas between thousands."""
+    return f"{value:,.{digits}f}"
 
 
 def count(number: int, noun: str) -> str:

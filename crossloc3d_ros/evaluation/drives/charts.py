@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import math
-from html import escape
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 from scipy.stats import chi2
 
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
 from crossloc3d_ros.evaluation.drives.track_scores import SIGMAS, WRONG_M, TrackScores, believed_error_m, contents
 from crossloc3d_ros.evaluation.recall import RANKS, Scores, horizontal_distances, submaps_within
 from crossloc3d_ros.pages import charts
-from crossloc3d_ros.pages.wording import count, percent
+from crossloc3d_ros.pages.wording import percent_range
 from crossloc3d_ros.types import Float64Array, TrackState
 
-TARGET_MS = 40.0
-_POSE_TARGET_MS = 100.0
-PLACE_CLASSES = ((25.0, "near", "fix within 25 m"), (50.0, "fair", "within 50 m"), (100.0, "far", "within 100 m"))
-POSE_CLASSES = ((1.0, "near", "fix within 1 m"), (3.0, "fair", "within 3 m"), (WRONG_M, "far", "within 10 m"))
-WORST = ("wrong", "farther off")
+_PLACE_TARGET_MS, _POSE_TARGET_MS = 40.0, 100.0
+PLACE_CLASSES = ((25.0, "near"), (50.0, "fair"), (100.0, "far"))
+POSE_CLASSES = ((1.0, "near"), (3.0, "fair"), (WRONG_M, "far"))
+WORST = "wrong"
 _WIDE = 1160.0
 _LOW_M = 0.02
 _STATE_HOLDS_S = 2.0
 """So long a state is drawn on after the scan that told it, where no other scan tells one."""
-_NOT_KNOWN = "<p>Not known: the recording has no position to compare with.</p>"
+_STEPS = ("prepare", "encode", "search", "align", "fuse")
 STATE_WORDS = {
     TrackState.SEARCHING: "searching",
     TrackState.AMBIGUOUS: "several places",
@@ -32,8 +33,44 @@ STATE_WORDS = {
     TrackState.LOST: "lost",
 }
 
-Classes = tuple[tuple[float, str, str], ...]
-"""Upper limit of the error in metres, name in the style sheet, words."""
+Classes = tuple[tuple[float, str], ...]
+"""Upper limit of the error in metres, name in the style sheet."""
+
+
+@dataclass(frozen=True)
+class StateStrip:
+    """The state over time."""
+
+    chart: Markup
+    seen: tuple[str, ...]
+    """The states that occur."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Cumulative errors."""
+
+    chart: Markup
+    has_fixes: bool
+    has_aligned: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Latency:
+    """Time from scan to estimate, milliseconds."""
+
+    values_ms: Float64Array
+    """Of the scans that were measured."""
+    median_ms: float
+    p95_ms: float
+    max_ms: float
+    goal_ms: float
+    shown_ms: float
+    """Where the histogram ends."""
+    beyond: int
+    """Scans that took longer."""
+    steps_ms: Mapping[str, float]
+    """Median of each step that was measured."""
 
 
 def error_classes(table: EstimateTable) -> Classes:
@@ -45,7 +82,7 @@ def class_of(error_m: float, classes: Classes) -> str:
     """Return the name of an error's colour."""
     if not math.isfinite(error_m):
         return "unscored"
-    return next((css for limit, css, _ in classes if error_m <= limit), WORST[0])
+    return next((css for limit, css in classes if error_m <= limit), WORST)
 
 
 def seconds_of(table: EstimateTable) -> Float64Array:
@@ -63,29 +100,22 @@ def two_sigma_m(table: EstimateTable) -> Float64Array:
     return result
 
 
-def timeline(table: EstimateTable, chosen: list[int]) -> str:
-    """Return state, error, heading and belief over the drive, below each other on one axis of time."""
-    if not table.has_track:
-        return error_chart(table, chosen)
-    parts = [_state_strip(table), error_chart(table, chosen)]
-    if np.isfinite(table.heading_error_rad).any():
-        parts.append(_heading_chart(table, chosen))
-    if np.isfinite(table.probability).any():
-        parts.append(_belief_chart(table, chosen))
-    return "".join(parts)
+def duration_s(table: EstimateTable) -> float:
+    """Return the seconds from the first to the last scan."""
+    return float(table.stamp_ns[-1] - table.stamp_ns[0]) / 1e9 if len(table) else 0.0
 
 
 def _time_axis(table: EstimateTable) -> charts.Axis:
-    seconds = seconds_of(table)
-    last = float(seconds[-1]) if len(seconds) else 0.0
-    return charts.linear_axis(0.0, max(last, 1e-3), "seconds since the first scan", suffix=" s", steps=10)
+    return charts.linear_axis(0.0, max(duration_s(table), 1e-3), "seconds since the first scan", suffix=" s", steps=10)
 
 
-def _state_strip(table: EstimateTable) -> str:
-    """Return a strip with the state over time, a segment for each stretch of one state."""
+def state_strip(table: EstimateTable) -> StateStrip | None:
+    """Return a strip with a segment for each stretch of one state; None of places."""
+    if not table.has_track:
+        return None
     seconds = seconds_of(table)
     chart = charts.Chart(
-        charts.Axis(0.0, max(float(seconds[-1]), 1e-3) if len(seconds) else 1e-3, "", []),
+        charts.Axis(0.0, max(duration_s(table), 1e-3), "", []),
         charts.Axis(0.0, 1.0, "", []),
         "State over time",
         width=_WIDE,
@@ -110,24 +140,20 @@ def _state_strip(table: EstimateTable) -> str:
                 f"<title>{STATE_WORDS[state]}, {seconds[first]:.1f} to {until:.1f} s</title></rect>"
             )
         begin = j
-    seen = {state for state in states if state is not None}
-    legend = "".join(
-        f'<span><i class="key state-{state.value}"></i>{STATE_WORDS[state]}</span>'
-        for state in TrackState
-        if state in seen
-    )
-    return (
-        f'<div class="scroll strip">{chart.render(marks, "states", "timeline bare")}</div><p class="below">{legend}</p>'
-    )
+    seen = tuple(state.value for state in TrackState if state in states)
+    return StateStrip(chart.render(marks, "states", "timeline bare"), seen)
 
 
-def error_chart(table: EstimateTable, chosen: list[int]) -> str:
-    """Return the error of each fix and of each scan's first candidate over time, with the 2 sigma of poses."""
+def error_chart(table: EstimateTable, chosen: list[int]) -> Markup | None:
+    """Return the error of each fix and of each scan's first candidate over time, with the 2 sigma of poses.
+
+    None where no truth is known.
+    """
     errors = table.error_m
     first = _candidate_errors(table)[:, :1].min(axis=1, initial=np.inf)
     known = np.isfinite(first) | np.isfinite(errors)
     if not known.any():
-        return _NOT_KNOWN
+        return None
     seconds, tracked = seconds_of(table), table.has_track
     classes = error_classes(table)
     largest = max(float(np.max(values[np.isfinite(values)], initial=1.0)) for values in (errors, first))
@@ -158,20 +184,13 @@ def error_chart(table: EstimateTable, chosen: list[int]) -> str:
             2.4 if tracked else 3.2,
         ),
     ]
-    shade = (
-        '<span><i class="key shade"></i>2 sigma: the long half-axis of the ellipse that should hold 95 % of the '
-        "errors</span>"
-        if tracked
-        else ""
-    )
-    return f'<div class="scroll">{chart.render(marks, "errors", "timeline")}</div>' + (
-        '<p class="below"><span><i class="key near"></i><i class="key fair"></i><i class="key far"></i>'
-        f'<i class="key wrong"></i>fixes, coloured as on the map</span>{shade}<span><i class="key none"></i>first '
-        "candidate of every scan, fix or not</span><span>The scale is logarithmic. Click to choose a scan.</span></p>"
-    )
+    return chart.render(marks, "errors", "timeline")
 
 
-def _heading_chart(table: EstimateTable, chosen: list[int]) -> str:
+def heading_chart(table: EstimateTable, chosen: list[int]) -> Markup | None:
+    """Return the heading error of each fix over time; None where none is known."""
+    if not np.isfinite(table.heading_error_rad).any():
+        return None
     seconds = seconds_of(table)
     chart = charts.Chart(
         _time_axis(table),
@@ -187,13 +206,13 @@ def _heading_chart(table: EstimateTable, chosen: list[int]) -> str:
         chart.band(seconds[chosen], np.full(len(chosen), low), np.clip(sigma[chosen], low, 180.0), "inside"),
         chart.dots(seconds[chosen], off[chosen], ["heading"] * len(chosen), 2.0),
     ]
-    return f'<div class="scroll">{chart.render(marks, "headings", "timeline")}</div>' + (
-        '<p class="below"><span><i class="key heading"></i>heading of each fix</span>'
-        '<span><i class="key shade"></i>2 sigma: should hold 95 % of the errors</span></p>'
-    )
+    return chart.render(marks, "headings", "timeline")
 
 
-def _belief_chart(table: EstimateTable, chosen: list[int]) -> str:
+def belief_chart(table: EstimateTable, chosen: list[int]) -> Markup | None:
+    """Return the belief of each scan over time; None where there is none."""
+    if not np.isfinite(table.probability).any():
+        return None
     seconds = seconds_of(table)
     chart = charts.Chart(
         _time_axis(table),
@@ -206,26 +225,23 @@ def _belief_chart(table: EstimateTable, chosen: list[int]) -> str:
     off_m = believed_error_m(table)
     css = ["right" if off_m[i] < WRONG_M else "wrong" if math.isfinite(off_m[i]) else "unscored" for i in chosen]
     marks = [chart.dots(seconds[chosen], doubt[chosen], css, 2.0)]
-    return f'<div class="scroll">{chart.render(marks, "beliefs", "timeline")}</div>' + (
-        f'<p class="below"><span>Belief that the error is below {WRONG_M:g} m, fix or not</span>'
-        '<span><i class="key right"></i>it was</span><span><i class="key wrong"></i>it was not</span></p>'
-    )
+    return chart.render(marks, "beliefs", "timeline")
 
 
 # Calibration
 
 
-def belief_calibration(track: TrackScores) -> str:
-    """Return how often a belief was right, beside how often it said it would be."""
+def belief_calibration(track: TrackScores) -> Markup | None:
+    """Return how often a belief was right, beside how often it said it would be; None without any."""
     rows = track.beliefs
     if not rows:
-        return "<p>Not known: no belief has a truth beside it.</p>"
+        return None
     chart = charts.Chart(
         charts.Axis(
             0.0,
             float(len(rows)),
             f"believed probability of an error below {WRONG_M:g} m",
-            [(i + 0.5, _range_words(row.low, row.high)) for i, row in enumerate(rows)],
+            [(i + 0.5, percent_range(row.low, row.high)) for i, row in enumerate(rows)],
         ),
         charts.share_axis("was so"),
         "Believed probability against the share that was right",
@@ -237,26 +253,14 @@ def belief_calibration(track: TrackScores) -> str:
         marks.append(chart.level(i + 0.16, i + 0.84, row.mean_belief, "belief"))
         marks.append(chart.whisker(x, row.right.low, row.right.high, "whisker"))
         marks.append(chart.dots(np.array([x]), np.array([row.right.value]), ["share"], 5.0))
-    words = "".join(
-        f"<tr><th scope='row'>{_range_words(row.low, row.high)}</th><td>{row.scans:,}</td>"
-        f"<td>{_exact(row.mean_belief)}</td><td>{_exact(row.right.value)}</td></tr>"
-        for row in rows
-    )
-    return (
-        f'{chart.render(marks, "belief-calibration")}<p class="below"><span><i class="key share"></i>was so, with the '
-        'range that holds the true share in 95 of 100 such drives</span><span><i class="key stroke"></i>said so: an '
-        "honest belief has its dot on its line</span></p>"
-        '<details><summary>The same in figures</summary><table class="small"><thead><tr><th scope="col">believed</th>'
-        '<th scope="col">scans</th><th scope="col">mean belief</th><th scope="col">right</th></tr></thead>'
-        f"<tbody>{words}</tbody></table></details>"
-    )
+    return chart.render(marks, "belief-calibration")
 
 
-def coverage_chart(table: EstimateTable, track: TrackScores) -> str:
-    """Return which share of the errors lies inside of the region that should hold a given share."""
+def coverage_chart(table: EstimateTable) -> Markup | None:
+    """Return which share of the errors lies inside of the region that should hold a given share; None without any."""
     positions, headings = contents(table)
     if not len(positions):
-        return "<p>Not known: no fix has a truth beside it.</p>"
+        return None
     chart = charts.Chart(
         charts.Axis(0.0, 1.0, "should hold", [(i / 4, f"{25 * i} %") for i in range(5)]),
         charts.share_axis("held"),
@@ -271,44 +275,18 @@ def coverage_chart(table: EstimateTable, track: TrackScores) -> str:
         if sigma < 3.0:  # the third leaves no room
             marks.append(chart.word(content - 0.055, 0.03, f"{sigma:g} sigma"))
     marks.append(chart.line(at, charts.cumulative(positions, len(positions), at), "s-fix"))
-    keys = ['<span><i class="key stroke" style="background:none;border-color:var(--near)"></i>position</span>']
     if len(headings):
         marks.append(chart.line(at, charts.cumulative(headings, len(headings), at), "s-heading"))
-        keys.append(
-            '<span><i class="key stroke" style="background:none;border-color:var(--heading)"></i>heading</span>'
-        )
-    rows = "".join(
-        f"<tr><th scope='row'>{row.sigma:g} sigma</th><td>{_exact(row.expected)}</td>"
-        f"<td>{_exact(row.position)}</td><td>{_exact(row.heading)}</td></tr>"
-        for row in track.coverage
-    )
-    return (
-        f'{chart.render(marks, "coverage")}<p class="below">{"".join(keys)}<span>below the dashed line: the covariance '
-        "promises too much</span></p>"
-        '<table class="small"><thead><tr><th scope="col">inside of</th><th scope="col">should be</th>'
-        f'<th scope="col">position</th><th scope="col">heading</th></tr></thead><tbody>{rows}</tbody></table>'
-    )
-
-
-def _range_words(low: float, high: float) -> str:
-    if low <= 0.0:
-        return f"< {100 * high:g} %"
-    return f"≥ {100 * low:g} %" if high >= 1.0 else f"{100 * low:g}–{100 * high:g} %"
-
-
-def _exact(share: float) -> str:
-    if not math.isfinite(share) or share in (0.0, 1.0):
-        return percent(share)
-    return f"{100 * share:.1f} %" if share < 0.9995 else f"{100 * min(share, 0.9999):.2f} %"
+    return chart.render(marks, "coverage")
 
 
 # Altogether
 
 
-def cdf_chart(table: EstimateTable, scores: Scores | None, submaps: Float64Array) -> str:
-    """Return the cumulative errors of fixes, of aligned poses and of candidates."""
+def error_distribution(table: EstimateTable, scores: Scores | None, submaps: Float64Array) -> Distribution | None:
+    """Return the cumulative errors of fixes, of aligned poses and of candidates; None where no truth is known."""
     if scores is None:
-        return _NOT_KNOWN
+        return None
     scored = np.isfinite(table.truth_grid).all(axis=1)
     distances = _candidate_errors(table)[scored]
     fixes = table.error_m[scored & table.has_fix]
@@ -328,54 +306,47 @@ def cdf_chart(table: EstimateTable, scores: Scores | None, submaps: Float64Array
     for rank in reversed(RANKS):
         best = np.fmin.reduce(distances[:, :rank], axis=1) if distances.shape[1] else np.full(len(distances), np.nan)
         marks.append(chart.line(at, charts.cumulative(best, len(distances), at), f"s-{rank}"))
-    keys = [("wrong", "first candidate"), ("far", "best of five"), ("fair", "best of 25")]
     if len(aligned):
         marks.append(chart.line(at, charts.cumulative(aligned, len(aligned), at), "s-aligned"))
-        keys.insert(0, ("aligned", "first aligned pose"))
     if len(fixes):
         marks.append(chart.line(at, charts.cumulative(fixes, len(fixes), at), "s-fix"))
-        keys.insert(0, ("near", "fixes, of those given"))
-    legend = "".join(
-        f'<span><i class="key stroke" style="background:none;border-color:var(--{css})"></i>{text}</span>'
-        for css, text in keys
+    return Distribution(chart.render(marks), has_fixes=len(fixes) > 0, has_aligned=len(aligned) > 0)
+
+
+def measure_latency(table: EstimateTable) -> Latency | None:
+    """Return the time from scan to estimate; None where it was not measured."""
+    values = table.latency_ms[np.isfinite(table.latency_ms)]
+    if not len(values):
+        return None
+    goal = _POSE_TARGET_MS if table.has_track else _PLACE_TARGET_MS
+    shown = max(float(np.percentile(values, 99.5)) * 1.15, goal * 1.25)
+    steps = {name: column[np.isfinite(column)] for name, column in zip(_STEPS, table.timings_ms.T, strict=False)}
+    return Latency(
+        values_ms=values,
+        median_ms=float(np.median(values)),
+        p95_ms=float(np.percentile(values, 95)),
+        max_ms=float(values.max()),
+        goal_ms=goal,
+        shown_ms=shown,
+        beyond=int((values > shown).sum()),
+        steps_ms={name: float(np.median(step)) for name, step in steps.items() if (step > 0).any()},
     )
-    lot = '<span><i class="key stroke lot"></i>one submap by lot</span>'
-    return chart.render(marks) + f'<p class="below">{legend}{lot}</p>'
 
 
-def latency_chart(table: EstimateTable, latency_is: str) -> str:
+def latency_chart(latency: Latency) -> Markup:
     """Return a histogram of the time from scan to estimate."""
-    latency = table.latency_ms
-    latency = latency[np.isfinite(latency)]
-    if not len(latency):
-        return "<p>Not measured.</p>"
-    target = _POSE_TARGET_MS if table.has_track else TARGET_MS
-    high = max(float(np.percentile(latency, 99.5)) * 1.15, target * 1.25)
-    edges = np.linspace(0.0, high, 51)
-    counts, _ = np.histogram(np.minimum(latency, high), edges)
-    shares = counts / len(latency)
+    edges = np.linspace(0.0, latency.shown_ms, 51)
+    counts, _ = np.histogram(np.minimum(latency.values_ms, latency.shown_ms), edges)
+    shares = counts / len(latency.values_ms)
     chart = charts.Chart(
-        charts.linear_axis(0.0, high, "milliseconds a scan"),
+        charts.linear_axis(0.0, latency.shown_ms, "milliseconds a scan"),
         charts.linear_axis(0.0, 100 * float(shares.max()), "% of scans", steps=4),
         "Histogram of the time from scan to estimate",
     )
     marks = [chart.bar(edges[i], edges[i + 1], 100 * share, "bar") for i, share in enumerate(shares) if share > 0]
-    marks.append(chart.mark_x(target, "limit", f"goal {target:g} ms"))
-    marks.append(chart.mark_x(float(np.median(latency)), "median", f"median {np.median(latency):.1f} ms", row=1))
-    beyond = int((latency > high).sum())
-    text = f"Measured {latency_is}."
-    steps = table.timings_ms[:, :-1]
-    names = ("preparing", "encoding", "searching", "aligning", "following")
-    parts = [
-        f"{name} {np.median(values):.1f} ms"
-        for name, column in zip(names, steps.T, strict=True)
-        if len(values := column[np.isfinite(column)]) and (values > 0).any()
-    ]
-    if parts:
-        text += f" Median parts: {', '.join(parts)}."
-    if beyond:
-        text += f" {count(beyond, 'scan')} took longer than shown, {latency.max():.0f} ms at most."
-    return chart.render(marks) + f'<p class="below">{escape(text)}</p>'
+    marks.append(chart.mark_x(latency.goal_ms, "limit", f"goal {latency.goal_ms:g} ms"))
+    marks.append(chart.mark_x(latency.median_ms, "median", f"median {latency.median_ms:.1f} ms", row=1))
+    return chart.render(marks)
 
 
 def _chance_curve(truth: Float64Array, submaps: Float64Array, at: Float64Array) -> Float64Array:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,61 +21,48 @@ SHOWN_CANDIDATES = 10
 SHOWN_POSES = 6
 
 
-def draw_map(table: EstimateTable, backdrop: Backdrop, chosen: list[int]) -> str:
-    """Return the map as SVG: the picture, the way that was driven, and a dot for each fix."""
+@dataclass(frozen=True)
+class MapView:
+    """The map of a drive, in metres right of and below the upper left corner of its picture."""
+
+    picture_uri: str
+    width_m: float
+    height_m: float
+    pixel_m: float
+    """About a pixel on a desk; the script keeps it exact."""
+    scale_m: int
+    """Length of the scale bar."""
+    path: str
+    """The path driven, as commands of an SVG path."""
+    fixes: tuple[tuple[str, float, float], ...]
+    """The class of each fix in the style sheet, and where it lies."""
+
+
+def map_view(table: EstimateTable, backdrop: Backdrop, chosen: list[int]) -> MapView:
+    """Return the picture, the path that was driven, and a dot for each fix."""
     west, south, east, north = backdrop.bounds
     width, height = east - west, north - south
-    unit = width / 700.0  # about a pixel on a desk; scripts keep it exact
     truth = to_view(table.truth_grid[chosen], backdrop)
-    fixes = to_view(table.grid[chosen, :2], backdrop)
+    places = to_view(table.grid[chosen, :2], backdrop)
     errors, classes = table.error_m[chosen], error_classes(table)
     carried = jumped(np.hypot(*np.diff(truth, axis=0).T), np.diff(seconds_of(table)[chosen]))
-    path = _path(np.insert(truth, np.flatnonzero(carried) + 1, np.nan, axis=0))
-    small = " small" if table.has_track else ""
-    marks = [
-        f'<path class="truthcase" stroke-width="{4.6 * unit:.2f}" d="{path}"/>'
-        f'<path class="truthline" stroke-width="{2.2 * unit:.2f}" d="{path}"/>'
-    ]
-    for i, (x, y) in enumerate(fixes):
-        if table.has_fix[chosen[i]] and math.isfinite(x):
-            css = class_of(float(errors[i]), classes)
-            marks.append(f'<circle class="fixdot{small} {css}" cx="{x:.1f}" cy="{y:.1f}" r="{3.6 * unit:.2f}"/>')
-    return (
-        f'<svg id="map" viewBox="0 0 {width:.1f} {height:.1f}" role="img" aria-label="Map with track and fixes">'
-        f'<image id="picture" href="{backdrop.data_uri}" x="0" y="0" width="{width:.1f}" height="{height:.1f}" '
-        f'preserveAspectRatio="none"/><g id="marks" style="--px:{unit:.3f}">{"".join(marks)}</g>'
-        f'<g id="overlay"></g>{_scale_bar(width, height)}</svg>'
+    return MapView(
+        picture_uri=backdrop.data_uri,
+        width_m=width,
+        height_m=height,
+        pixel_m=width / 700.0,
+        scale_m=max(v for v in (10, 20, 50, 100, 200, 500, 1000, 2000) if v <= max(10.0, width / 4)),
+        path=_path(np.insert(truth, np.flatnonzero(carried) + 1, np.nan, axis=0)),
+        fixes=tuple(
+            (class_of(float(error), classes), float(x), float(y))
+            for (x, y), error, is_fix in zip(places, errors, table.has_fix[chosen], strict=True)
+            if is_fix and math.isfinite(x)
+        ),
     )
 
 
-def legend(table: EstimateTable, *, scored: bool) -> str:
-    """Return what the marks on the map mean; where there are several kinds, as switches that show and hide them."""
-    items = []
-    if scored:
-        items.append('<span><i class="key stroke" style="border-color:#888"></i>where the robot was</span>')
-        items += [f'<span><i class="key {css}"></i>{text}</span>' for _, css, text in error_classes(table)]
-        items.append(f'<span><i class="key {WORST[0]}"></i>{WORST[1]}</span>')
-    else:
-        items.append('<span><i class="key unscored"></i>fix, not checked</span>')
-    items.append('<span><i class="key square empty"></i>no laser return: water, or not flown</span>')
-    if table.has_track:
-        items.append("<span>Of the chosen scan:</span>")
-        items += [
-            f'<label><input type="checkbox" data-layer="{layer}" checked><i class="key {css}"></i>{text}</label>'
-            for layer, css, text in (
-                ("candidates", "square marked", "retrieved squares"),
-                ("aligned", "aligned", "aligned poses"),
-                ("hypotheses", "hypothesis", "hypotheses, 95 %"),
-            )
-        ]
-    else:
-        items.append('<span><i class="key square marked"></i>candidates of the chosen scan</span>')
-    items.append("<span>Click a place on the track or a fix to choose its scan; Ctrl + wheel zooms.</span>")
-    return "".join(items)
-
-
-def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame: MapFrame) -> str:
-    """Return what the page's script needs, as JSON: metres right of and below the map's corner, headings on the map."""
+def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame: MapFrame) -> dict[str, Any]:
+    """Return what the page's script needs: metres right of and below the map's corner, headings on the map."""
     seconds = seconds_of(table)
     truth, fixes = to_view(table.truth_grid, backdrop), to_view(table.grid[:, :2], backdrop)
     errors, latency = table.error_m, table.latency_ms
@@ -123,12 +110,12 @@ def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame
                 "hypotheses": _poses(table.hypotheses, i, backdrop, with_ellipse=True),
             }
         scans.append(scan)
-    limits = [{"limit": limit, "name": css} for limit, css, _ in error_classes(table)]
+    limits = [{"limit": limit, "name": css} for limit, css in error_classes(table)]
     top = int((table.candidate_ids >= 0).sum(axis=1).max(initial=0))
-    content = {
+    return {
         "scans": scans,
         "reasons": list(reasons),
-        "classes": [*limits, {"limit": None, "name": WORST[0]}],
+        "classes": [*limits, {"limit": None, "name": WORST}],
         "states": {state.value: words for state, words in STATE_WORDS.items()},
         "exhaustive": EXHAUSTIVE,
         "tracked": table.has_track,
@@ -138,8 +125,6 @@ def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame
         "duration": round(float(seconds[-1]), 3) if len(seconds) else 0.0,
         "start": _first_shown(table, scans),
     }
-    # "</" would end the script element in the middle of the data.
-    return json.dumps(content, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
 
 
 def to_view(grid: Float64Array, backdrop: Backdrop) -> Float64Array:
@@ -181,20 +166,6 @@ def _poses(poses: PoseLists, scan: int, backdrop: Backdrop, *, with_ellipse: boo
             row += _ellipse(poses.covariance[scan, rank]) or [None] * 3
         rows.append(row)
     return rows
-
-
-def _scale_bar(width: float, height: float) -> str:
-    length = max(v for v in (10, 20, 50, 100, 200, 500, 1000, 2000) if v <= max(10.0, width / 4))
-    unit = width / 700.0
-    left, base = 14 * unit, height - 14 * unit
-    path = f"M{left:.1f} {base - 6 * unit:.1f}v{6 * unit:.1f}h{length}v{-6 * unit:.1f}"
-    return (
-        f'<path d="{path}" fill="none" stroke="#fff" stroke-width="{2 * unit:.2f}"/>'
-        f'<text x="{left + length / 2:.1f}" y="{base - 5 * unit:.1f}" font-size="{12 * unit:.1f}" '
-        f'stroke-width="{3 * unit:.2f}" text-anchor="middle">{length} m</text>'
-        f'<text x="{width - 18 * unit:.1f}" y="{height - 14 * unit:.1f}" font-size="{13 * unit:.1f}" '
-        f'stroke-width="{3 * unit:.2f}" text-anchor="middle">N ↑</text>'
-    )
 
 
 def _ellipse(covariance: Float64Array) -> list[float] | None:
