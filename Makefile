@@ -9,12 +9,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Results depend on some dependencies' versions; a robot's install need not hold them.
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
 
-.PHONY: help setup demo test test-all lint bench colcon clean
+.PHONY: help setup demo test test-all lint docs docs-serve bench colcon clean
 
 help:
 	@echo "make demo      build the Amsterdam map, drive a simulated robot through it, localize it, write out/demo/index.html"
 	@echo "make test      lint, types, import contracts and the quick tests"
 	@echo "make test-all  the slow tests too"
+	@echo "make docs      write the generated references and build the site into out/docs"
 	@echo "make bench     latencies and rates beside this machine's matrix-multiply peak, to out/bench/"
 	@echo "make colcon    build with colcon into install/, to check the ament packaging"
 
@@ -42,6 +43,15 @@ test: lint
 
 test-all: lint
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: setup
+	$(BIN)/python docs/generate.py
+	$(BIN)/python -m mkdocs build --quiet --strict
+	@echo "out/docs/index.html"
+
+docs-serve: setup
+	$(BIN)/python -m mkdocs serve
 
 bench: setup
 	$(BIN)/python -m bench --output out/bench

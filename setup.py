@@ -28,6 +28,8 @@ COMMANDS = [
     "simulate",
     "train",
 ]
+# The site of docs/; from 2 on MkDocs does without plugins and themes of others.
+DOCS = ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10"]
 LAUNCHER = """#!/usr/bin/env python3
 import sys
 
@@ -98,7 +100,9 @@ setup(
         # Where the robot has no odometry of its own: from scan to scan.
         "odometry": ["kiss-icp>=1.2"],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
+        "docs": DOCS,
         "test": [
+            *DOCS,
             "hypothesis>=6",
             "import-linter>=2",
             "mypy>=1.10",

@@ -1,4 +1,4 @@
-"""The nouns that pass between the packages: frozen, named, with shape, unit and frame beside each field.
+"""Types passed between the packages: frozen, with shape, unit and frame beside each field.
 
 Frames. `lidar`: as the sensor gives it (x forward, y left, z up). `base`: the robot's `base_link`
 (REP-103). `grid`: the map's projected CRS, easting/northing/height in metres, float64. `map`: the ENU

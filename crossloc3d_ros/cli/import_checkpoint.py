@@ -23,13 +23,19 @@ PUBLISHED = PreprocessingConfig(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(prog="import_checkpoint", description=__doc__)
+    arguments = _parser().parse_args(argv)
+    return run(lambda: _import(arguments))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="import_checkpoint", description="Turn the authors' torch file into this package's weights."
+    )
     parser.add_argument("checkpoint", type=Path, help="the authors' .pth file (701 tensors in 'model_state_dict')")
     parser.add_argument("--output", type=Path, required=True, help="the .safetensors file to write")
     parser.add_argument("--preset", choices=("campus", "oxford"), default="campus", help="the model that it holds")
     parser.add_argument("--float32", action="store_true", help="keep full precision (twice the size)")
-    arguments = parser.parse_args(argv)
-    return run(lambda: _import(arguments))
+    return parser
 
 
 def _import(arguments: argparse.Namespace) -> int:

@@ -1,1 +1,1 @@
-"""Points in, points out: filters, ground, rasters, the one patch normalisation. NumPy and Numba only."""
+"""Points in, points out: filters, ground, rasters, patches. NumPy and Numba only."""

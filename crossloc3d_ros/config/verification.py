@@ -16,7 +16,7 @@ class HeightMapConfig:
     sectors: int = option(60, "sectors of the full circle: 60 = headings in steps of 6 degrees", low=4, high=720)
     reach: int = option(2, "centres tried on either side of the robot along both axes: 2 = 25", low=0, high=10)
     step_m: float = option(3.5, "distance between neighbouring centres", low=0.1, high=50.0)
-    top_deg: float = option(15.0, "the sensor's highest beam above the horizon", low=0.0, high=89.0)
+    top_deg: float = option(15.0, "elevation of the sensor's highest beam", low=0.0, high=89.0)
     smooth: int = option(1, "cells on either side that the survey's map is smoothed over", low=0, high=10)
 
 
@@ -24,5 +24,5 @@ class HeightMapConfig:
 class VerificationConfig:
     """How many answers are looked at again, and how far each distance counts."""
 
-    candidates: int = option(300, "first answers of a query that are compared by height maps", low=1, high=100_000)
-    weight: float = option(293.0, "of the height maps' distance; the descriptors' counts once", low=0.0, high=1e6)
+    candidates: int = option(300, "retrieved submaps of a query that are compared by height maps", low=1, high=100_000)
+    weight: float = option(293.0, "weight of the height maps' distance beside the descriptors'", low=0.0, high=1e6)

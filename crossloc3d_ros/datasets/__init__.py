@@ -1,1 +1,1 @@
-"""What training and evaluation are made of: places, raw scans and drives with ground truth, benchmarks."""
+"""Data of training and evaluation: places, raw scans and drives with ground truth, benchmarks."""

@@ -1,1 +1,1 @@
-"""Patch in, descriptor out: the CrossLoc3D network, its weights and its fast CPU runtime."""
+"""From a patch to a descriptor: the CrossLoc3D network, its weights and its compiled CPU runtime."""

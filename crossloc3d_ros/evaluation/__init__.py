@@ -1,1 +1,1 @@
-"""Replay of bags, recall, and the page that shows both."""
+"""Retrieval, poses and drives scored against ground truth, with intervals, and their pages."""

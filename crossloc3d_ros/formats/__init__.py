@@ -1,1 +1,1 @@
-"""The outside world to our types and back: PointCloud2, LAS, bags."""
+"""Formats of others to our types and back: PointCloud2, LAS, bags, published datasets."""

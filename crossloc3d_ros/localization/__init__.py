@@ -1,1 +1,1 @@
-"""Scan in, estimate out."""
+"""From a scan to an estimate: retrieval, alignment, fusion."""

@@ -1,1 +1,1 @@
-"""A town, an airborne survey of it and a robot with a VLP-16 driving through it."""
+"""A simulated town, an airborne survey of it, and a robot with a VLP-16 that drives through it."""

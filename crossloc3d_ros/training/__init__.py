@@ -1,1 +1,1 @@
-"""Places to learn from, the loss and the loop."""
+"""Training data, the losses and the training loop; comparison tables, fitting, the model card."""

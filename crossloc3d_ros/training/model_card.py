@@ -76,19 +76,22 @@ def _introduction(config: TrainConfig, material: Material, history: Sequence[dic
     data = "simulated towns" if isinstance(material, Towns) else f"the dataset described below ({material.preset})"
     if isinstance(material, Towns) and any("surveys" in m.settings for m in material.manifests):
         data = "simulated towns and surveyed surfaces"
-    begun = "from scratch" if not history else f"from `{history[-1]['weights']}` on (see “What came before”)"
+    begun = "from scratch" if not history else f"from `{history[-1]['weights']}` (see “Previous weights”)"
     if config.headings > 1:
         query = (
             f"The heading of a query matters: it is encoded in {config.headings} headings, and the nearest descriptor "
-            "counts, which tells the heading besides."
+            "counts, which also gives the heading."
         )
     elif config.rotations > 1:
-        query = f"A query's descriptor is the mean over {config.rotations} turns of it; its heading does not matter."
+        query = (
+            f"The descriptor of a query is the mean over {config.rotations} test-time rotations; its heading does not "
+            "matter."
+        )
     else:
         query = "The heading of a query does not matter."
     return (
         "LiDAR place recognition: a scan against submaps of an airborne survey, heading unknown. The network is "
-        f"{_NAMES[config.model.network]}, with the settings below; the weights were learned {begun}, on {data}. "
+        f"{_NAMES[config.model.network]}, with the settings below; the weights were trained {begun}, on {data}. "
         f"{query}\n"
     )
 
@@ -121,26 +124,26 @@ def _benchmarks(results: Sequence[dict[str, Any]]) -> str:
     lines = [
         "## Benchmarks\n",
         "Written by `evaluate`. In brackets the 95 % interval of a bootstrap over whole towns, or over squares of 50 m "
-        "where there are fewer than eight towns; “by lot” is R@1 at 100 m of a random order. Nothing was trained or "
-        "tuned on them.\n",
+        "where there are fewer than eight towns; the chance level is R@1 at 100 m of a random order. Nothing was "
+        "trained or tuned on them.\n",
         "| benchmark | database | heading of the query | queries | "
         + " | ".join(f"{label} {radius:.0f} m" for label, radius in _MEASURES)
-        + " | by lot |",
+        + " | chance level |",
         "|---" * (5 + len(_MEASURES)) + "|",
     ]
     for scores in results:
         about, figures = scores["about"], scores["all"]
         tried = about["query_headings"]
-        how = {"nearest": "nearest kept", "mean": "mean descriptor"}[about["way"]]
+        how = {"nearest": "nearest descriptor", "mean": "mean descriptor"}[about["way"]]
         heading = "north-aligned" if about["heading"] == "aligned" else "random"
-        heading += f", {tried} tried, {how}" if tried > 1 else ""
+        heading += f", {tried} rotations, {how}" if tried > 1 else ""
         if verified := about.get("verified"):
-            heading += f"; first {verified:,} ordered by height maps too"
+            heading += f"; first {verified:,} reordered by height maps"
         cells = [_percent(figures[measure]) for measure in _MEASURES]
-        lot = f"{100 * figures['R@1', 100.0]['chance']:.1f} %"
+        chance = f"{100 * figures['R@1', 100.0]['chance']:.1f} %"
         lines.append(
             f"| {about['benchmark']} | {about['setting']}, {about['database']:,} | {heading} | "
-            f"{figures['R@1', 100.0]['queries']:,} | {' | '.join(cells)} | {lot} |"
+            f"{figures['R@1', 100.0]['queries']:,} | {' | '.join(cells)} | {chance} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -157,8 +160,8 @@ def _results(entry: dict[str, Any]) -> str:
         "## Validation\n",
         f"{entry['queries']:,} scans of places that training never saw, against one database of "
         f"{entry['submaps']:,} submaps of those places. In brackets the 95 % Wilson interval over the queries; queries "
-        "of one town resemble each other, so the true interval is wider. These places served to pick "
-        "`best.safetensors`, and to fit the calibration that travels with the weights.\n",
+        "of one town resemble each other, so the true interval is wider. They served to "
+        "select `best.safetensors` and to fit the calibration that is stored with the weights.\n",
         "| within | measure | recall | chance |",
         "|---|---|---|---|",
     ]
@@ -172,7 +175,7 @@ def _distances(entry: dict[str, Any]) -> str:
     lines = [
         "## Descriptor distances on the same places\n",
         "Euclidean, to the submap whose centre is nearest to the scan, and to the nearest descriptor among the submaps "
-        "more than 100 m away. The same numbers travel in the weights' metadata (`distances`).\n",
+        "more than 100 m away. The same numbers are in the metadata of the weights (`distances`).\n",
         "| quantile | " + " | ".join(f"{100 * q:.0f} %" for q in QUANTILES) + " |",
         "|---|" + "---|" * len(QUANTILES),
         "| right | " + " | ".join(f"{d:.2f}" for d in entry["true_distances"]) + " |",
@@ -183,7 +186,7 @@ def _distances(entry: dict[str, Any]) -> str:
 
 def _course(validations: list[dict[str, Any]]) -> str:
     lines = [
-        "## How it got there\n",
+        "## Course of the training\n",
         "| minutes | steps | R@1 100 m | R@1 25 m | R@25 100 m |",
         "|---|---|---|---|---|",
     ]
@@ -211,7 +214,7 @@ def _towns(manifest: Manifest) -> str:
         made = (
             "Simulated, by this package, from seeds; no real data. "
             f"`train make-places --towns {settings['towns']} --validation-towns {settings['validation_towns']} "
-            f"--seed {settings['seed']}` with the settings below makes the same places again.\n"
+            f"--seed {settings['seed']}` with the settings below reproduces the places.\n"
         )
     else:
         made = (
@@ -238,8 +241,9 @@ def _families(towns: list[TownEntry]) -> str:
 
 def _history(history: Sequence[dict[str, Any]]) -> str:
     lines = [
-        "## What came before\n",
-        "The run began with the last of these weights, as far as their tensors fit; each began with the one above.\n",
+        "## Previous weights\n",
+        "The run started from the last of these weights, as far as their tensors fit; each of them from the one "
+        "above.\n",
         "| weights | fingerprint | steps | hours | loss | seed |",
         "|---|---|---|---|---|---|",
     ]
@@ -296,10 +300,10 @@ def _recipe(config: TrainConfig) -> str:
         parts.append("the published augmentation")
     elif config.headings == 1:
         parts.append(
-            "both sides of a pair turned over the full circle and mirrored together, scans thinned and partly blocked"
+            "both sides of a pair rotated over the full circle and mirrored together, scans thinned and partly occluded"
         )
     else:
-        parts.append("pairs turned and mirrored together, near each other in heading, scans thinned and partly blocked")
+        parts.append("pairs rotated and mirrored together, close in heading, scans thinned and partly occluded")
     if config.ema_decay > 0.0:
         parts.append("averaged weights with batch-norm statistics of their own")
     return "; ".join(parts) + "."
@@ -311,11 +315,11 @@ def _limits(material: Material) -> str:
         seen = "the places of one dataset: other towns, seasons and sensors differ, and figures do not carry over"
     return f"""## What it cannot do
 
-* It has seen {seen}. Judge it on a drive through a survey of your own before relying on it.
-* It tells places apart by what stands above the ground within reach of a patch. Open fields, water, forests without \
-structure, tunnels and interiors give it nothing to go by.
-* It knows the sensors that its data were taken with, upright within a few degrees.
-* A descriptor gives a place, not a metre: the nearest submap's centre is the answer.
+* It has seen {seen}. Evaluate it on a drive of your own before relying on it.
+* It distinguishes places by what stands above the ground within a patch. Open fields, water, forests without \
+structure, tunnels and interiors have nothing of that kind.
+* It is made for the sensors of its data, upright within a few degrees.
+* A descriptor gives a place, not a pose: the centre of the nearest submap.
 """
 
 

@@ -68,7 +68,7 @@ def test_the_card_takes_in_the_results_of_every_benchmark(
     rows = [line for line in card.splitlines() if line.startswith("| simulated |")]
     assert len(rows) == 4
     assert "62.5 % [50.0, 75.0]" in rows[0] and "27,000" in rows[0] and "north-aligned" in rows[0]
-    assert "random, 8 tried, nearest kept" in rows[1] and "5.0 %" in rows[1]
+    assert "random, 8 rotations, nearest descriptor" in rows[1] and "5.0 %" in rows[1]
     assert "50.0 % [50.0, 75.0]" in rows[3] and "11.1 %" not in card
 
 
@@ -98,7 +98,7 @@ def test_the_card_of_exported_weights_shows_their_own_validation(finished: Path,
     best = next(r for r in examined["recalls"] if (r["label"], r["radius_m"]) == ("R@1", 100.0))
     interval = f"{100 * best['value']:.1f} % [{100 * best['low']:.1f}, {100 * best['high']:.1f}]"
     assert f"| 100 m | R@1 | {interval} |" in card
-    assert "from scratch" in card and "What came before" not in card
+    assert "from scratch" in card and "Previous weights" not in card
 
 
 def test_the_card_tells_what_came_before_and_how_it_was_learned(
@@ -113,8 +113,8 @@ def test_the_card_tells_what_came_before_and_how_it_was_learned(
     first = load_checkpoint(finished / run_folder.FINAL).fingerprint
     assert re.search(rf"\| final\.safetensors \| `{first}` \| 2 \| [\d.]+ \| info_nce \| 1 \|", card)
     for words in (
-        "from `final.safetensors` on", "--initial final.safetensors", "encoded in 4 headings", "average precision",
-        "chunks of 3 pairs", "weights confused", "near each other in heading",
+        "from `final.safetensors` (see", "--initial final.safetensors", "encoded in 4 headings", "average precision",
+        "chunks of 3 pairs", "weights confused", "close in heading",
     ):  # fmt: skip
         assert words in card
 
