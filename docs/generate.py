@@ -222,7 +222,8 @@ def command_section(name: str, parser: argparse.ArgumentParser, level: int) -> I
         for action in shown:
             if has_recipe and action.dest in recipe:
                 continue
-            text = (action.help or "") % {**vars(action), "prog": name}
+            choices = ", ".join(f"`{choice}`" for choice in action.choices or ())
+            text = (action.help or "") % {**vars(action), "prog": name} + (f"; one of {choices}" if choices else "")
             rows.append(f"| {cell(f'`{spelled(action)}`')} | {cell(text)} |")
         yield "\n".join(rows) + "\n"
         if has_recipe:
@@ -251,10 +252,7 @@ def spelled(action: argparse.Action) -> str:
     names = ", ".join(action.option_strings)
     if action.nargs == 0:
         return names
-    values = action.metavar or (
-        f"{{{','.join(map(str, action.choices))}}}" if action.choices else
-        action.dest.upper() if action.option_strings else action.dest
-    )  # fmt: skip
+    values = action.metavar or (action.dest.upper() if action.option_strings else action.dest)
     value = " ".join(values) if isinstance(values, tuple) else values
     if action.nargs in ("+", "*"):
         value += " ..."
