@@ -13,10 +13,10 @@ from launch import LaunchContext, LaunchDescription
 
 SETTINGS = {
     "map": (str, "folder of the aerial map"),
-    "weights": (str, "weights file; the shipped weights where none is named"),
+    "weights": (str, "weights file; empty = the shipped weights"),
     "autostart": (bool, "whether the node configures and activates itself"),
-    "odometry": (str, "topic, scan or none: what tells how the robot has moved"),
-    "tf_broadcast": (bool, "whether map -> odom goes to /tf while localized"),
+    "odometry": (str, "topic, scan or none: source of the robot's motion"),
+    "tf_broadcast": (bool, "publish map -> odom on /tf while localized"),
     "use_sim_time": (bool, "whether the time comes from /clock"),
 }
 """Parameters that can be given as arguments; what is left empty stays as the parameter file has it."""
@@ -30,7 +30,7 @@ def generate_launch_description() -> LaunchDescription:
         "points": ("/velodyne_points", "topic of the clouds"),
         "odom": ("/odom", "topic of the odometry"),
         "imu": ("/imu", "topic of the IMU, where the parameter use_imu or use_imu_heading is set"),
-        "initialpose": ("/initialpose", "topic of first guesses, as RViz publishes them"),
+        "initialpose": ("/initialpose", "topic of initial poses, as RViz publishes them"),
         "params_file": (str(defaults), "file of all parameters"),
         "namespace": ("", "namespace of the node"),
         "log_level": ("info", "debug, info, warn or error"),

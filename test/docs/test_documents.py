@@ -203,3 +203,12 @@ def test_the_topics_of_the_reference_are_those_of_the_node() -> None:
     reference = (REPOSITORY / "docs" / "reference" / "topics.md").read_text()
     assert len(topics) >= 12
     assert {topic for topic in topics if f"| `{topic}`<br>" not in reference} == set()
+
+
+def test_the_values_of_the_diagnostics_are_those_of_the_node() -> None:
+    page = (REPOSITORY / "docs" / "howto" / "diagnostics.md").read_text()
+    table = page.partition("## Values in `/diagnostics`")[2].partition("## ")[0]
+    named = [name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`([^`]+)`", row)]
+    source = "".join(path.read_text() for path in (REPOSITORY / "crossloc3d_ros" / "ros").glob("*.py"))
+    assert len(named) >= 20
+    assert [name for name in named if f'"{name}"' not in source] == []
