@@ -30,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="build_map",
-        description="Build an aerial map that a robot can be localized in. An interrupted build goes on where it "
-        "stopped when the same command is given again.",
+        description="Build an aerial map that a robot can be localized in. An interrupted build continues "
+        "when the same command is given again.",
     )
     parser.add_argument("files", nargs="+", help="LAS, LAZ or COPC files, folders with such files, globs")
     parser.add_argument("--output", required=True, type=Path, help="the map's folder, such as maps/town")

@@ -36,12 +36,12 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="compare",
         description="Train every row of a table on the same places, by the same recipe, for the same budget, and "
-        "examine all on one benchmark (aerial database, random heading). A table that was stopped goes on where it "
-        "was; a larger budget goes on with the runs that are there.",
+        "evaluate all on one benchmark (aerial database, random heading). An interrupted table continues; a larger "
+        "budget continues the runs that exist.",
     )
     parser.add_argument("--table", choices=TABLE_NAMES, required=True, help="what is compared")
     parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="only these rows (see --list)")
-    parser.add_argument("--list", action="store_true", help="name the table's rows and do nothing")
+    parser.add_argument("--list", action="store_true", help="list the rows of the table and exit")
     parser.add_argument("--places", type=Path, action="append", help="folder of make-places; may be repeated")
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument("--budget-minutes", type=float, help="time on the clock for each row")

@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, default=Path("out/demo"), help="folder (default: %(default)s)")
     parser.add_argument("--surveys", type=Path, help="folder with the two surveys (default: maps/amsterdam)")
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
-    parser.add_argument("--fresh", action="store_true", help="make map and drive anew even if they are current")
+    parser.add_argument("--fresh", action="store_true", help="make map and drive again even if they are current")
     drive_defaults = DemoDrive()
     parser.add_argument("--length-m", type=float, default=drive_defaults.length_m, help="(default: %(default)s)")
     parser.add_argument("--speed-m-s", type=float, default=drive_defaults.speed_m_s, help="(default: %(default)s)")

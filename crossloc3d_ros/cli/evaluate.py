@@ -69,10 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="evaluate",
-        description="Ask weights for the places of ground scans in a database of aerial submaps, write what they "
-        "answer, and score it: recall at 100, 50 and 25 m with chance and interval, curves, pictures, one HTML page. "
-        "With --protocol pose, ask the whole localizer for poses, of single scans and along drives. A run that was "
-        "stopped goes on where it was.",
+        description="Retrieve the places of ground scans among aerial submaps, write the predictions, and score them: "
+        "recall at 100, 50 and 25 m with chance level and interval, curves, pictures, one HTML page. With --protocol "
+        "pose, evaluate poses of the whole localizer, of single scans and along drives. An interrupted run continues "
+        "when the same command is given again.",
     )
     parser.add_argument(
         "--protocol", choices=["place", "pose"], default="place",
@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--benchmark", choices=list(dict.fromkeys([*BENCHMARKS, *POSE_SETS])), default="simulated",
-        help="fitting: for poses alone, towns to tune settings on (default: %(default)s)",
+        help="fitting: towns to tune settings on, for poses only (default: %(default)s)",
     )  # fmt: skip
     source.add_argument("--dataset", type=Path, help="folder in the layout of CS-Campus3D, as make_dataset writes it")
     parser.add_argument(
@@ -97,21 +97,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--heading", nargs="+", choices=HEADING_MODES, default=list(HEADING_MODES),
-        help="queries turned to north, or as the robot stood (default: both)",
+        help="queries aligned to north, or of random heading (default: both)",
     )  # fmt: skip
     parser.add_argument(
         "--query-headings", nargs="+", type=int, metavar="N",
-        help="try each query of unknown heading in so many headings; several numbers are compared (default: as many "
-        "as the weights were trained for)",
+        help="headings in which a query of unknown heading is encoded; several numbers are compared (default: that of "
+        "the weights)",
     )  # fmt: skip
     parser.add_argument(
         "--verify", type=int, default=0, metavar="N",
-        help="also order the first N answers among aerial submaps, such as 300, anew by height maps, and score them "
-        "both ways (default: %(default)s)",
+        help="also reorder the first N retrieved aerial submaps, such as 300, by height maps, and score both "
+        "orders (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--verify-weight", type=float, default=VerificationConfig().weight, metavar="W",
-        help="how much height maps count beside descriptors; see `train verification` (default: %(default)s)",
+        help="weight of height maps beside descriptors; see `train verification` (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE",
@@ -119,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--odometry", choices=["wheels", "scan", "none"], default="wheels",
-        help="with --protocol pose: what tells along drives how the robot moves (default: %(default)s)",
+        help="with --protocol pose: source of the robot's motion along drives (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--every", type=int, default=1, metavar="N",
@@ -134,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--device", default="cpu", help="where the encoder runs: cpu or cuda (default: %(default)s)")
     parser.add_argument(
-        "--only-score", action="store_true", help="score the predictions that lie in --output; nothing is encoded"
+        "--only-score", action="store_true", help="score the predictions in --output; nothing is encoded"
     )
     add_verbosity(parser)
     return parser

@@ -12,17 +12,17 @@ from crossloc3d_ros.errors import CrossLocError
 
 USAGE = """usage: localizer --ros-args -p map:=FOLDER [-p NAME:=VALUE ...] [--params-file FILE] [-r points:=TOPIC]
 
-Tell from LiDAR scans where on an aerial map the robot is.
+Localize a LiDAR on an aerial map.
 
 subscribes  points                           sensor_msgs/PointCloud2
             odom                             nav_msgs/Odometry, where odometry is topic
             imu                              sensor_msgs/Imu, where use_imu or use_imu_heading is set
-            initialpose                      geometry_msgs/PoseWithCovarianceStamped, in `map`, `earth` or what TF knows
-publishes   ~/fix                            sensor_msgs/NavSatFix, one for each scan that is worked on
+            initialpose                      geometry_msgs/PoseWithCovarianceStamped, in `map`, `earth` or a frame of TF
+publishes   ~/fix                            sensor_msgs/NavSatFix, one for each scan that is processed
             ~/pose                           geometry_msgs/PoseWithCovarianceStamped, latched, only with a fix
             ~/state                          diagnostic_msgs/DiagnosticStatus, latched: searching, ambiguous,
                                              localized or lost, and why
-            ~/hypotheses                     geometry_msgs/PoseArray, likeliest first
+            ~/hypotheses                     geometry_msgs/PoseArray, most probable first
             ~/candidates                     geometry_msgs/PoseArray
             ~/candidate_table                sensor_msgs/PointCloud2, with the pose at which the scan fits around each
             ~/markers                        visualization_msgs/MarkerArray

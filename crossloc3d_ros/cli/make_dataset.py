@@ -37,8 +37,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="make_dataset",
         description="Make a dataset in the layout of CS-Campus3D out of recordings with points and GNSS and the aerial "
-        "survey of the same area, split into areas to learn from, to validate and to test on. An interrupted call goes "
-        "on where it stopped when it is given again.",
+        "survey of the same area, split into training, validation and test areas. An interrupted call continues when "
+        "it is given again.",
     )
     parser.add_argument("--bags", nargs="+", type=Path, required=True, help="rosbag2 folders, .mcap, .db3 or .bag")
     parser.add_argument("--survey", nargs="+", required=True, metavar="FILE", help="LAS/LAZ files, folders, globs")
@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     cut = parser.add_argument_group("submaps and patches")
     add_options(cut, BuildConfig, _BUILD)  # type: ignore[arg-type]  # a group takes arguments as a parser does
     add_options(cut, PreprocessingConfig, _PREPROCESSING)  # type: ignore[arg-type]
-    mounting = parser.add_argument_group("mounting of the lidar on the robot (stronger than --config)")
+    mounting = parser.add_argument_group("mounting of the lidar on the robot (takes precedence over --config)")
     add_options(mounting, MountingConfig)  # type: ignore[arg-type]
     add_verbosity(parser)
     return parser

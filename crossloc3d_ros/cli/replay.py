@@ -75,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="replay",
         description="Localize every scan of a recording and score the fixes against its GNSS; or play the recording "
-        "into ROS with its own timing, where 'ros2 bag' is not at hand.",
+        "into ROS with its own timing, where 'ros2 bag' is not installed.",
         epilog="With --publish, remappings may follow: --ros-args -r /velodyne_points:=/points",
     )
     parser.add_argument("bag", type=Path, help="rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag")
@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument(
         "--odometry",
         choices=("topic", "scan", "none"),
-        help="how the robot has moved between scans: told by a topic, by the scans themselves (KISS-ICP), or unknown "
+        help="source of the robot's motion: a topic, the scans by KISS-ICP, or none "
         "(default: topic, where the recording has one)",
     )
     localize.add_argument("--odom-topic", help="Odometry topic (default: the only one beside ground truth, or /odom)")
@@ -103,10 +103,10 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th scan (default: all)")
     localize.add_argument("--output", type=Path, help="folder for the results (default: out/replay/BAG)")
     localize.add_argument(
-        "--config", type=Path, help="parameter file of the localizer node; what is given here is stronger"
+        "--config", type=Path, help="parameter file of the localizer node; options given here take precedence"
     )
 
-    mounting = parser.add_argument_group("mounting of the lidar on the robot (stronger than --config)")
+    mounting = parser.add_argument_group("mounting of the lidar on the robot (takes precedence over --config)")
     add_options(mounting, MountingConfig)  # type: ignore[arg-type]  # a group takes arguments as a parser does
 
     publish = parser.add_argument_group("play into ROS")

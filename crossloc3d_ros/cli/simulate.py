@@ -1,4 +1,4 @@
-"""Drive a simulated VLP-16 through a real survey or through a made-up town."""
+"""Drive a simulated VLP-16 through a real survey or through a simulated town."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Make places to learn from, learn from them, write the weights and their card."""
+"""Make training places, train on them, write the weights and their card."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     places = commands.add_parser("make-places", help="simulate towns, their surveys and scans in them")
-    places.add_argument("--towns", type=int, default=40, help="towns to learn from (default: 40)")
-    places.add_argument("--validation-towns", type=int, default=6, help="towns to validate on (default: 6)")
+    places.add_argument("--towns", type=int, default=40, help="training towns (default: 40)")
+    places.add_argument("--validation-towns", type=int, default=6, help="validation towns (default: 6)")
     places.add_argument("--seed", type=int, default=1, help="another seed, other towns (default: 1)")
     places.add_argument(
         "--survey", nargs="+", metavar="FILE",
-        help="instead of towns: drive through the surface of this survey (LAS or LAZ), to learn the area of a map",
+        help="instead of towns: drive through the surface of this survey (LAS or LAZ), to train for the area of a map",
     )  # fmt: skip
     places.add_argument("--scans", type=int, default=1200, help="scans in the survey (default: 1200)")
     places.add_argument("--crs", help="of survey files that name none, such as EPSG:28992")
-    places.add_argument("--output", type=Path, required=True, help="folder; towns that lie in it already are kept")
+    places.add_argument("--output", type=Path, required=True, help="folder; towns that it holds already are kept")
     places.add_argument("--config", type=Path, help="YAML file of which `places` and `train` are read")
     places.add_argument("--workers", type=int, default=1, help="processes (default: 1)")
     places.set_defaults(action=_make_places)
@@ -51,9 +51,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--output", type=Path, required=True, help="folder of the run")
     budget = run.add_mutually_exclusive_group(required=True)
     budget.add_argument("--budget-minutes", type=float, help="time on the clock, validation included")
-    budget.add_argument("--budget-steps", type=int, help="batches: the same run to the bit, however often resumed")
-    run.add_argument("--initial", type=Path, metavar="WEIGHTS", help="begin with what fits of these weights")
-    run.add_argument("--resume", action="store_true", help="go on with the run in --output")
+    budget.add_argument("--budget-steps", type=int, help="batches: the same result to the bit, however often resumed")
+    run.add_argument("--initial", type=Path, metavar="WEIGHTS", help="start from the tensors of these weights that fit")
+    run.add_argument("--resume", action="store_true", help="continue the run in --output")
     run.add_argument("--config", type=Path, help="YAML file of which `train` is read")
     common.add_options(run, TrainConfig)
     run.set_defaults(action=_run)
@@ -68,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.set_defaults(action=_export)
 
-    card = commands.add_parser("card", help="write the card of exported weights anew, with benchmarks' results in it")
+    card = commands.add_parser("card", help="write the card of exported weights with the results of benchmarks")
     card.add_argument("run", type=Path, help="folder of the run that the weights are from")
     card.add_argument("--weights", type=Path, required=True, help="exported weights; the card lies beside them")
     card.add_argument("--places", type=Path, action="append", default=[], help="where its places are, if moved")
@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     curve.add_argument("--output", type=Path, help="file to write (default: progress.html in the run)")
     curve.set_defaults(action=_curve)
     alignment = commands.add_parser(
-        "alignment", help="learn how likely a beam is returned from what the aerial map shows, and what scores mean"
+        "alignment", help="fit the observation model of the alignment and the calibration of its scores"
     )
     alignment.add_argument(
         "--data",
@@ -95,15 +95,18 @@ def _parser() -> argparse.ArgumentParser:
     alignment.set_defaults(action=_alignment)
 
     verification = commands.add_parser(
-        "verification", help="fit how much height maps count beside descriptors in `evaluate --verify`"
+        "verification", help="fit the weight of height maps beside descriptors for `evaluate --verify`"
     )
     verification.add_argument(
         "--places", type=Path, required=True, action="append",
-        help="folder of make-places whose validation towns are asked, may be repeated",
+        help="folder of make-places whose validation towns are used, may be repeated",
     )  # fmt: skip
-    verification.add_argument("--weights", type=Path, help="weights to search with (default: the shipped ones)")
+    verification.add_argument("--weights", type=Path, help="weights of the retrieval (default: the shipped ones)")
     verification.add_argument(
-        "--candidates", type=int, default=300, help="answers of a query that are compared (default: %(default)s)"
+        "--candidates",
+        type=int,
+        default=300,
+        help="retrieved submaps of a query that are compared (default: %(default)s)",
     )
     verification.add_argument(
         "--data", type=Path, default=Path("out/benchmark"),
