@@ -29,6 +29,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _ANSWER_WITHIN_S = 10
+_NO_ENCODER = "these workers were opened without an encoder"
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -60,7 +61,7 @@ class LocalWorker:
 
     shared_threads = True
 
-    def __init__(self, encoder: DescriptorEncoder) -> None:
+    def __init__(self, encoder: DescriptorEncoder | None) -> None:
         self._encoder = encoder
 
     def run(
@@ -77,6 +78,8 @@ class LocalWorker:
         advance: Advance,
     ) -> Iterator[Result]:
         """Yield the results in the order of the tasks."""
+        if self._encoder is None:
+            raise ConfigError(_NO_ENCODER)
         for task, _ in tasks:
             yield function(task, self._encoder, advance)
 
@@ -86,7 +89,7 @@ class RemoteWorkers(ABC):
 
     shared_threads = False
 
-    def __init__(self, loader: EncoderLoader) -> None:
+    def __init__(self, loader: EncoderLoader | None) -> None:
         try:
             self._pickled_loader = pickle.dumps(loader)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -130,7 +133,7 @@ class RemoteWorkers(ABC):
 class ProcessWorkers(RemoteWorkers):
     """Works in several processes of this machine."""
 
-    def __init__(self, executor: ProcessPoolExecutor, workers: int, loader: EncoderLoader) -> None:
+    def __init__(self, executor: ProcessPoolExecutor, workers: int, loader: EncoderLoader | None) -> None:
         super().__init__(loader)
         self._executor = executor
         self._in_flight = 2 * workers
@@ -156,7 +159,7 @@ class ProcessWorkers(RemoteWorkers):
 class DaskWorkers(RemoteWorkers):
     """Works on the machines of a Dask cluster that see the same folders as this one."""
 
-    def __init__(self, client: Any, loader: EncoderLoader) -> None:
+    def __init__(self, client: Any, loader: EncoderLoader | None) -> None:
         super().__init__(loader)
         self._client = client
 
@@ -183,11 +186,16 @@ class DaskWorkers(RemoteWorkers):
 
 @contextmanager
 def open_workers(
-    loader: EncoderLoader, encoder: DescriptorEncoder, workers: int, scheduler: str | None, folder: Path
+    loader: EncoderLoader | None,
+    encoder: DescriptorEncoder | None,
+    workers: int,
+    scheduler: str | None,
+    folder: Path,
 ) -> Iterator[Workers]:
-    """Give the workers that were asked for; `folder` is where the work lies, and all of them must see it.
+    """Give the requested workers; `folder` is where the work lies, and all of them must see it.
 
-    Raises ConfigError where the cluster does not answer or does not see the folder.
+    Without loader and encoder they do tasks that need none. Raises ConfigError where the cluster does not answer or
+    does not see the folder.
     """
     if scheduler is not None:
         with _dask_client(scheduler, folder) as client:
@@ -294,5 +302,7 @@ def _load_once(pickled_loader: bytes) -> DescriptorEncoder:
 
 @functools.lru_cache(maxsize=1)
 def _load(pickled_loader: bytes) -> DescriptorEncoder:
-    loader: EncoderLoader = pickle.loads(pickled_loader)
+    loader: EncoderLoader | None = pickle.loads(pickled_loader)
+    if loader is None:
+        raise ConfigError(_NO_ENCODER)
     return loader()

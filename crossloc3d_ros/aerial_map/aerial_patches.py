@@ -1,73 +1,59 @@
-"""The submaps of a survey as patches on disk, cut by the map builder itself, so that they are those of a map."""
+"""The submaps of a survey as patches on disk, cut as the map builder cuts them, without an encoder."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import json
+import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from crossloc3d_ros.aerial_map.builder import ProgressCallback, build_map
-from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
-from crossloc3d_ros.aerial_map.store import AerialMap, Manifest
-from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, to_dict
+from crossloc3d_ros.aerial_map import store
+from crossloc3d_ros.aerial_map.assemble import (
+    build_counts,
+    check_submaps,
+    results,
+    source_records,
+    survey_bounds,
+    write_submaps,
+)
+from crossloc3d_ros.aerial_map.disk import bytes_needed, room_on_disk
+from crossloc3d_ros.aerial_map.progress import ProgressCallback
+from crossloc3d_ros.aerial_map.store import SourceRecord, read_submaps
+from crossloc3d_ros.aerial_map.survey import Survey, read_survey
+from crossloc3d_ros.aerial_map.tiles import BuiltTiles, TileJob, build_tiles, check_config, continue_or_start
+from crossloc3d_ros.clouds.raster import Bounds
+from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
+from crossloc3d_ros.errors import MapError
+from crossloc3d_ros.files import atomic_path, work_lock
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
+from crossloc3d_ros.workers import open_workers
 
-
-class PatchEncoder:
-    """Describes a patch by its own points: a map built with it holds the submaps' patches in place of descriptors."""
-
-    def __init__(self, preprocessing: PreprocessingConfig) -> None:
-        self._preprocessing = preprocessing
-
-    @property
-    def fingerprint(self) -> str:
-        """Identify the preprocessing."""
-        text = json.dumps(to_dict(self._preprocessing), sort_keys=True)
-        return hashlib.sha256(f"patches {text}".encode()).hexdigest()
-
-    @property
-    def descriptor_size(self) -> int:
-        """Numbers in a patch."""
-        return 3 * self._preprocessing.n_points
-
-    @property
-    def preprocessing(self) -> PreprocessingConfig:
-        """Return how the patches are made."""
-        return self._preprocessing
-
-    def encode(self, points: Float32Array) -> Float32Array:
-        """Return the points (n, 3) of a patch in a row (3 n,)."""
-        return np.asarray(points, np.float32).reshape(-1)
-
-    def encode_batch(self, clouds: Sequence[Float32Array]) -> Float32Array:
-        """Return the points of B patches, (B, 3 n)."""
-        return np.stack([self.encode(cloud) for cloud in clouds])
-
-    def warm_up(self) -> None:
-        """Do nothing."""
+_PATCHES, _SURVEY = "patches.npy", "survey.json"
 
 
 @dataclass(frozen=True, eq=False)
 class AerialPatches:
     """The submaps of a survey."""
 
-    manifest: Manifest
+    crs: str
+    """The UTM zone."""
+    bounds: Bounds
+    """Min easting, min northing, max easting, max northing of the survey, metres."""
+    sources: tuple[SourceRecord, ...]
     grid: Float64Array
     """(M, 3) easting, northing, ground height of the centres, metres, UTM."""
-    index: DescriptorMap
+    all_patches: Float32Array
+    """(M, n, 3), mapped from the disk."""
 
     def __len__(self) -> int:
         return len(self.grid)
 
     def patches(self, rows: Int64Array) -> Float32Array:
         """Return the patches (len(rows), n, 3)."""
-        points = self.index.descriptors(rows)
-        return points.reshape(len(rows), -1, 3)
+        return np.array(self.all_patches[rows])
 
 
 def cut_aerial(
@@ -83,9 +69,50 @@ def cut_aerial(
 
     What was cut into the folder before is taken as it is; an interrupted call goes on. Raises as `build_map`.
     """
-    encoder = PatchEncoder(preprocessing)
-    if not folder.exists():
-        loader = functools.partial(PatchEncoder, preprocessing)
-        build_map(inputs, folder, loader, config, crs=crs, progress=progress)
-    aerial_map = AerialMap.load(folder, encoder.fingerprint)
-    return AerialPatches(aerial_map.manifest, aerial_map.submaps.grid, aerial_map.index)
+    work = folder.with_name(f"{folder.name}.build")
+    with work_lock(work, MapError, "build"):
+        if not folder.exists():
+            check_config(config)
+            survey = read_survey(inputs, crs)
+            job = TileJob(work, survey, config, preprocessing, None)
+            with room_on_disk(work, bytes_needed(survey, config, 3 * preprocessing.n_points)):
+                continue_or_start(job)
+                with open_workers(None, None, config.workers, None, work) as workers:
+                    built = build_tiles(job, workers, progress or (lambda _: None))
+                _write(folder, survey, built, preprocessing)
+            shutil.rmtree(work, ignore_errors=True)
+    return _read(folder)
+
+
+def _write(folder: Path, survey: Survey, built: BuiltTiles, preprocessing: PreprocessingConfig) -> None:
+    counts = build_counts(built)
+    check_submaps(counts, preprocessing)
+    about = {
+        "crs": survey.map_crs,
+        "bounds": survey_bounds(built),
+        "sources": [asdict(source) for source in source_records(survey, built)],
+    }
+    with atomic_path(folder, None, synced=True) as partial:
+        partial.mkdir()
+        write_submaps(partial / store.SUBMAPS, built, counts.submaps)
+        shape = (counts.submaps, preprocessing.n_points, 3)
+        with (partial / _PATCHES).open("wb") as file:
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(file, header)
+            for result in results(built):
+                file.write(np.ascontiguousarray(result.submap_values, "<f4").tobytes())
+        (partial / _SURVEY).write_text(json.dumps(about), encoding="utf-8")
+
+
+def _read(folder: Path) -> AerialPatches:
+    try:
+        about = json.loads((folder / _SURVEY).read_text(encoding="utf-8"))
+        west, south, east, north = about["bounds"]
+        sources = tuple(SourceRecord(**source) for source in about["sources"])
+        patches: Float32Array = np.load(folder / _PATCHES, mmap_mode="r")
+        crs = str(about["crs"])
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise MapError(
+            f"the submaps in {folder} are damaged ({error}); delete the folder and cut them again"
+        ) from error
+    return AerialPatches(crs, (west, south, east, north), sources, read_submaps(folder / store.SUBMAPS).grid, patches)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,10 +15,12 @@ from crossloc3d_ros.aerial_map import store
 from crossloc3d_ros.aerial_map.descriptor_map import write_descriptors
 from crossloc3d_ros.aerial_map.geotiff import write_geotiff
 from crossloc3d_ros.aerial_map.spool import TileKey, tile_bounds, tiles_touched
-from crossloc3d_ros.aerial_map.store import BuildCounts, Manifest, SourceRecord
-from crossloc3d_ros.aerial_map.tile import TileReport, TileResult, read_result
+from crossloc3d_ros.aerial_map.store import BuildCounts, GroundMethod, Manifest, SourceRecord
+from crossloc3d_ros.aerial_map.survey import Survey
+from crossloc3d_ros.aerial_map.tile import TileResult, read_result
+from crossloc3d_ros.aerial_map.tiles import BuiltTiles
 from crossloc3d_ros.clouds.raster import Bounds
-from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.files import sync
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array
@@ -28,60 +30,39 @@ _TILES_IN_MEMORY = 16
 
 def write_map(
     folder: Path,
-    tiles: Sequence[tuple[TileReport, Path]],
-    *,
-    crs: str,
-    vertical_reference: str,
-    geoid_separation_m: float | None,
+    survey: Survey,
+    built: BuiltTiles,
     encoder: DescriptorEncoder,
     config: BuildConfig,
-    counts: BuildCounts,
-    sources: Sequence[SourceRecord],
+    geoid_separation_m: float | None,
     advance: Callable[[int], None],
 ) -> Manifest:
     """Write all files of the map into `folder`, which must not be in use, and return its manifest.
 
-    `advance` is told of each file. Raises AerialDataError where no tile has a submap.
+    `advance` counts the files. Raises AerialDataError where no tile has a submap.
     """
-    ordered = sorted(tiles, key=lambda item: (item[0].key[1], item[0].key[0]))
-    count = sum(report.submaps for report, _ in ordered)
-    if count == 0:
-        raise AerialDataError(
-            f"the area is empty: of its {counts.points_used:,} points nowhere at least "
-            f"{encoder.preprocessing.min_points} stand above the ground within one submap; no map was made"
-        )
+    counts = build_counts(built)
+    check_submaps(counts, encoder.preprocessing)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-
-    def results() -> Iterator[TileResult]:
-        for report, path in ordered:
-            if report.submaps:
-                yield read_result(path)
-
-    write_descriptors(
-        folder / store.DESCRIPTORS, (result.descriptors for result in results()), count, encoder.descriptor_size
-    )
+    descriptors = (result.submap_values for result in results(built))
+    write_descriptors(folder / store.DESCRIPTORS, descriptors, counts.submaps, encoder.descriptor_size)
     advance(1)
-    ground_heights = _write_submaps(folder / store.SUBMAPS, results(), count)
+    ground_heights = write_submaps(folder / store.SUBMAPS, built, counts.submaps)
     advance(1)
-    bounds = _union([report.data_bounds for report, _ in ordered if report.data_bounds is not None])
-    rasters = _TileRasters({report.key: path for report, path in ordered}, config)
-    write_geotiff(folder / store.TERRAIN, bounds, config.cell_m, crs, rasters.terrain, "terrain height")
-    advance(1)
-    write_geotiff(folder / store.SURFACE, bounds, config.cell_m, crs, rasters.surface, "surface height")
-    advance(1)
-    write_geotiff(folder / store.LOWEST, bounds, config.cell_m, crs, rasters.lowest, "lowest echo")
-    advance(1)
+    bounds = survey_bounds(built)
+    _write_rasters(folder, built, bounds, survey.map_crs, config, advance)
+    sources = source_records(survey, built)
     methods = {source.ground for source in sources}
     manifest = Manifest(
-        crs=crs,
+        crs=survey.map_crs,
         origin=(
             float(round((bounds[0] + bounds[2]) / 2.0)),
             float(round((bounds[1] + bounds[3]) / 2.0)),
             round(float(np.median(ground_heights)), 1),
         ),
         bounds=bounds,
-        vertical_reference=vertical_reference,
+        vertical_reference=survey.vertical.name,
         geoid_separation_m=geoid_separation_m,
         encoder_fingerprint=encoder.fingerprint,
         descriptor_size=encoder.descriptor_size,
@@ -99,18 +80,84 @@ def write_map(
     return manifest
 
 
-def _write_submaps(path: Path, results: Iterator[TileResult], count: int) -> Float32Array:
+def check_submaps(counts: BuildCounts, preprocessing: PreprocessingConfig) -> None:
+    """Raise AerialDataError where the survey has no submap."""
+    if counts.submaps == 0:
+        raise AerialDataError(
+            f"the area is empty: of its {counts.points_used:,} points nowhere at least "
+            f"{preprocessing.min_points} stand above the ground within one submap; no map was made"
+        )
+
+
+def results(built: BuiltTiles) -> Iterator[TileResult]:
+    """Yield the results of the tiles that have submaps, row by row."""
+    for report, path in sorted(built.tiles, key=lambda item: (item[0].key[1], item[0].key[0])):
+        if report.submaps:
+            yield read_result(path)
+
+
+def survey_bounds(built: BuiltTiles) -> Bounds:
+    """Return the bounds of all cells that hold points, in the map's CRS."""
+    west, south, east, north = np.array([r.data_bounds for r in built.reports if r.data_bounds is not None]).T
+    return float(west.min()), float(south.min()), float(east.max()), float(north.max())
+
+
+def build_counts(built: BuiltTiles) -> BuildCounts:
+    """Return what became of the survey's points and of the places where a submap could be."""
+    spooled, tiles, stray = built.spooled, built.reports, built.stray_points
+    kept = sum(report.points_kept for report in spooled)
+    return BuildCounts(
+        points_in_files=sum(report.points_in_file for report in spooled),
+        points_withheld=sum(report.points_withheld for report in spooled),
+        points_noise=sum(report.points_noise for report in spooled),
+        points_stray=sum(report.points_off_earth for report in spooled) + stray,
+        points_used=kept - stray,
+        tiles=len(tiles),
+        submaps=sum(report.submaps for report in tiles),
+        submaps_with_too_few_points=sum(report.too_few_points for report in tiles),
+        submaps_outside_survey=sum(report.outside_survey for report in tiles),
+    )
+
+
+def source_records(survey: Survey, built: BuiltTiles) -> list[SourceRecord]:
+    """Return the files that the tiles were made from, and where their ground points come from."""
+    methods = {report.key: report.ground for report in built.reports}
+    records = []
+    for header, report in zip(survey.headers, built.spooled, strict=True):
+        ground: GroundMethod = "filter"
+        if report.classified:
+            filtered = any(methods.get((column, row)) == "filter" for column, row, _ in report.tiles)
+            ground = "classes and filter" if filtered else "classes"
+        records.append(SourceRecord(header.path.name, header.size_bytes, header.point_count, header.crs, ground))
+    return records
+
+
+def write_submaps(path: Path, built: BuiltTiles, count: int) -> Float32Array:
     """Write the table of submaps and return the ground heights (count,)."""
     heights = np.empty(count, dtype=np.float32)
     written = 0
     with path.open("wb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(store.SUBMAP_DTYPE), "fortran_order": False, "shape": (count,)}
         np.lib.format.write_array_header_1_0(file, header)
-        for result in results:
+        for result in results(built):
             file.write(result.submaps.tobytes())
             heights[written : written + len(result.submaps)] = result.submaps["ground_height"]
             written += len(result.submaps)
     return heights
+
+
+def _write_rasters(
+    folder: Path, built: BuiltTiles, bounds: Bounds, crs: str, config: BuildConfig, advance: Callable[[int], None]
+) -> None:
+    rasters = _TileRasters({report.key: path for report, path in built.tiles}, config)
+    layers = (
+        (store.TERRAIN, rasters.terrain, "terrain height"),
+        (store.SURFACE, rasters.surface, "surface height"),
+        (store.LOWEST, rasters.lowest, "lowest echo"),
+    )
+    for name, values, description in layers:
+        write_geotiff(folder / name, bounds, config.cell_m, crs, values, description)
+        advance(1)
 
 
 class _TileRasters:
@@ -146,8 +193,3 @@ class _TileRasters:
                     t_north - top : t_north - bottom, left - t_west : right - t_west
                 ]
         return values
-
-
-def _union(bounds: Sequence[Bounds]) -> Bounds:
-    west, south, east, north = np.array(bounds).T
-    return float(west.min()), float(south.min()), float(east.max()), float(north.max())

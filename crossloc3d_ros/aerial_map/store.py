@@ -173,7 +173,7 @@ class AerialMap:
                 f"'build_map FILES... --output {folder} --overwrite' and these weights"
             )
         check_files(folder, manifest)
-        submaps = _read_submaps(folder / SUBMAPS)
+        submaps = read_submaps(folder / SUBMAPS)
         index = DescriptorMap.load(folder / DESCRIPTORS)
         if len(index) != len(submaps) or index.descriptor_size != manifest.descriptor_size:
             raise MapError(
@@ -243,7 +243,8 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _read_submaps(path: Path) -> SubmapTable:
+def read_submaps(path: Path) -> SubmapTable:
+    """Return the table of submaps; MapError where it is damaged."""
     try:
         rows: Any = np.load(path, allow_pickle=False)
     except (ValueError, OSError) as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,10 +18,11 @@ from crossloc3d_ros.aerial_map.store import SUBMAP_DTYPE, GroundMethod
 from crossloc3d_ros.clouds.ground import classify_ground
 from crossloc3d_ros.clouds.raster import Bounds, Raster, lowest_raster, surface_raster, terrain_raster
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
-from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.formats.las import GROUND
-from crossloc3d_ros.types import BoolArray, DescriptorEncoder, Float32Array, Float64Array, Patch, UInt8Array
+from crossloc3d_ros.stopwatch import Stopwatch
+from crossloc3d_ros.types import BoolArray, DescriptorEncoder, Float32Array, Float64Array, UInt8Array
 
 BATCH = 32
 """Patches encoded together: enough to keep the matrix products busy, few enough to stay in the caches."""
@@ -44,6 +44,7 @@ class TileTask:
     """Folder in the spool, tile, and whether that file is classified: of the tile and of those around it."""
     result: Path
     config: BuildConfig
+    preprocessing: PreprocessingConfig
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ class TileResult:
     report: TileReport
     submaps: np.ndarray[tuple[int], np.dtype[np.void]]
     """(K,) rows of SUBMAP_DTYPE."""
-    descriptors: Float32Array
-    """(K, D)."""
+    submap_values: Float32Array
+    """(K, D) descriptors, or (K, n, 3) patches where the submaps were only cut."""
     terrain: Float32Array
     """(H, W), row 0 in the north, the tile alone."""
     surface: Float32Array
@@ -96,73 +97,119 @@ def margin_m(half_extent_m: float, cell_m: float) -> float:
 
 
 def build_tile(task: TileTask, encoder: DescriptorEncoder, advance: Callable[[int], None] | None = None) -> TileReport:
-    """Work on one tile and write its result file; `advance` is told of submaps as they are done."""
-    config, preprocessing = task.config, encoder.preprocessing
-    inner = tile_bounds(task.key, config.tile_m)
-    margin = margin_m(preprocessing.half_extent_m, config.cell_m)
-    outer = (inner[0] - margin, inner[1] - margin, inner[2] + margin, inner[3] + margin)
+    """Cut the submaps of a tile, encode them and write the result file; `advance` counts the submaps."""
+    return _make_tile(task, encoder.encode_batch, (encoder.descriptor_size,), advance or _ignore)
 
-    started = time.perf_counter()
-    points, classes, source = read_points([s[:2] for s in task.sources], outer, config.tile_m)
-    read_at = time.perf_counter()
-    is_ground, ground = ground_points(points, classes, np.array([s[2] for s in task.sources], dtype=bool)[source])
-    ground_at = time.perf_counter()
-    terrain = terrain_raster(points, is_ground, outer, config.cell_m)
-    surface = surface_raster(points, outer, config.cell_m)
-    lowest = lowest_raster(points, outer, config.cell_m)
-    distance_m = distance_to_points(surface)
-    heights = points[:, 2] - terrain.sample(points[:, 0], points[:, 1])
-    raster_at = time.perf_counter()
 
-    cutter = SubmapCutter(np.column_stack([points[:, :2], heights]), preprocessing)
-    centres = submap_centres(inner, config.spacing_m)
-    covered = coverage(distance_m, surface, centres, preprocessing.half_extent_m) >= config.min_coverage
-    heights_m = ground_heights(terrain, centres)
-    covered &= np.isfinite(heights_m)
-    if advance is not None:
-        advance(int((~covered).sum()))
-    cut_s = time.perf_counter() - raster_at
-    encode_s = 0.0
-    places, descriptors = [], [np.empty((0, encoder.descriptor_size), np.float32)]
-    inside = np.flatnonzero(covered)
-    for start in range(0, len(inside), BATCH):
-        batch = inside[start : start + BATCH]
-        cut_from = time.perf_counter()
-        cut = [(i, cutter.cut(centres[i])) for i in batch]
-        patches: list[tuple[int, Patch]] = [(int(i), patch) for i, patch in cut if patch is not None]
-        encode_from = time.perf_counter()
-        if patches:
-            descriptors.append(encoder.encode_batch([patch.points for _, patch in patches]))
-        for i, patch in patches:
-            places.append((centres[i, 0], centres[i, 1], heights_m[i], patch.source_count))
-        cut_s += encode_from - cut_from
-        encode_s += time.perf_counter() - encode_from
-        if advance is not None:
-            advance(len(batch))
+def cut_tile(task: TileTask, advance: Callable[[int], None] | None = None) -> TileReport:
+    """Cut the submaps of a tile and write them with their patches; `advance` counts the submaps."""
+    return _make_tile(task, np.stack, (task.preprocessing.n_points, 3), advance or _ignore)
 
-    within = _inner_cells(surface, inner)
-    known = np.where(distance_m <= _TERRAIN_REACH_M, terrain.values, np.float32(np.nan))
+
+def _ignore(_: int) -> None:
+    """Count nothing."""
+
+
+def _make_tile(
+    task: TileTask,
+    encode: Callable[[list[Float32Array]], Float32Array],
+    shape: tuple[int, ...],
+    advance: Callable[[int], None],
+) -> TileReport:
+    """Write what `encode` makes of the tile's patches, an array of `shape` each."""
+    watch = Stopwatch()
+    read = _read_points(task)
+    read_s = watch.lap()
+    is_ground, ground = ground_points(read.points, read.classes, read.is_classified)
+    ground_s = watch.lap()
+    layers = _Layers.of(read.points, is_ground, read.bounds, task.config.cell_m)
+    heights = read.points[:, 2] - layers.terrain.sample(read.points[:, 0], read.points[:, 1])
+    raster_s = watch.lap()
+    cutter = SubmapCutter(np.column_stack([read.points[:, :2], heights]), task.preprocessing)
+    centres, outside = _submap_centres(task, layers)
+    advance(outside)
+    cut_s, encode_s = watch.lap(), 0.0
+    submaps: list[tuple[float, ...]] = []
+    values = [np.empty((0, *shape), np.float32)]
+    for start in range(0, len(centres), BATCH):
+        batch = centres[start : start + BATCH]
+        cut = [(centre, patch) for centre in batch if (patch := cutter.cut(centre[:2])) is not None]
+        cut_s += watch.lap()
+        if cut:
+            values.append(encode([patch.points for _, patch in cut]))
+        submaps += [(*centre.tolist(), patch.source_count) for centre, patch in cut]
+        encode_s += watch.lap()
+        advance(len(batch))
+    terrain, surface, lowest = layers.of_tile(task)
     report = TileReport(
         key=task.key,
-        submaps=len(places),
-        too_few_points=len(inside) - len(places),
-        outside_survey=int((~covered).sum()),
+        submaps=len(submaps),
+        too_few_points=len(centres) - len(submaps),
+        outside_survey=outside,
         ground=ground,
-        data_bounds=_data_bounds(surface.values[within], inner, config.cell_m),
-        times=TileTimes(read_at - started, ground_at - read_at, raster_at - ground_at, cut_s, encode_s),
+        data_bounds=_data_bounds(surface, tile_bounds(task.key, task.config.tile_m), task.config.cell_m),
+        times=TileTimes(read_s, ground_s, raster_s, cut_s, encode_s),
     )
-    write_result(
-        task.result,
-        TileResult(
-            report=report,
-            submaps=np.array(places, dtype=SUBMAP_DTYPE),
-            descriptors=np.concatenate(descriptors),
-            terrain=known[within],
-            surface=surface.values[within],
-            lowest=lowest.values[within],
-        ),
-    )
+    table = np.array(submaps, dtype=SUBMAP_DTYPE)
+    write_result(task.result, TileResult(report, table, np.concatenate(values), terrain, surface, lowest))
     return report
+
+
+@dataclass(frozen=True, eq=False)
+class _TilePoints:
+    """The points of a tile and of the margin around it."""
+
+    bounds: Bounds
+    points: Float64Array
+    """(N, 3) map's CRS, metres."""
+    classes: UInt8Array
+    is_classified: BoolArray
+    """(N,) whether the file of each point is classified."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Layers:
+    """The rasters of a tile and of the margin around it."""
+
+    terrain: Raster
+    surface: Raster
+    lowest: Raster
+    distance_m: Float32Array
+    """Of each cell to the nearest one that holds a point."""
+
+    @classmethod
+    def of(cls, points: Float64Array, is_ground: BoolArray, bounds: Bounds, cell_m: float) -> _Layers:
+        surface = surface_raster(points, bounds, cell_m)
+        return cls(
+            terrain_raster(points, is_ground, bounds, cell_m),
+            surface,
+            lowest_raster(points, bounds, cell_m),
+            distance_to_points(surface),
+        )
+
+    def of_tile(self, task: TileTask) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Return terrain, surface and lowest echoes without the margin, the terrain as far as it is known."""
+        within = _inner_cells(self.surface, tile_bounds(task.key, task.config.tile_m))
+        known = np.where(self.distance_m <= _TERRAIN_REACH_M, self.terrain.values, np.float32(np.nan))
+        return known[within], self.surface.values[within], self.lowest.values[within]
+
+
+def _read_points(task: TileTask) -> _TilePoints:
+    west, south, east, north = tile_bounds(task.key, task.config.tile_m)
+    margin = margin_m(task.preprocessing.half_extent_m, task.config.cell_m)
+    bounds = (west - margin, south - margin, east + margin, north + margin)
+    points, classes, source = read_points([s[:2] for s in task.sources], bounds, task.config.tile_m)
+    return _TilePoints(bounds, points, classes, np.array([s[2] for s in task.sources], dtype=bool)[source])
+
+
+def _submap_centres(task: TileTask, layers: _Layers) -> tuple[Float64Array, int]:
+    """Return easting, northing and ground height (K, 3) of the centres inside the survey; how many lie outside."""
+    config, half_extent_m = task.config, task.preprocessing.half_extent_m
+    centres = submap_centres(tile_bounds(task.key, config.tile_m), config.spacing_m)
+    heights_m = ground_heights(layers.terrain, centres)
+    inside = coverage(layers.distance_m, layers.surface, centres, half_extent_m) >= config.min_coverage
+    inside &= np.isfinite(heights_m)
+    return np.column_stack([centres, heights_m])[inside], int((~inside).sum())
 
 
 def ground_points(
@@ -189,7 +236,7 @@ def write_result(path: Path, result: TileResult) -> None:
             file,
             report=np.frombuffer(json.dumps(dataclasses.asdict(result.report)).encode(), dtype=np.uint8),
             submaps=result.submaps,
-            descriptors=result.descriptors,
+            submap_values=result.submap_values,
             terrain=result.terrain,
             surface=result.surface,
             lowest=result.lowest,
@@ -202,7 +249,7 @@ def read_result(path: Path) -> TileResult:
         return TileResult(
             report=_report(file["report"]),
             submaps=file["submaps"],
-            descriptors=file["descriptors"],
+            submap_values=file["submap_values"],
             terrain=file["terrain"],
             surface=file["surface"],
             lowest=file["lowest"],

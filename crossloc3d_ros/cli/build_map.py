@@ -96,7 +96,7 @@ def summary(report: BuildReport) -> str:
         ("reading", f"{report.points_read:,} points in {report.reading_s:.1f} s, {report.points_per_s:,.0f} a second"),
         (
             "encoding",
-            f"{report.places_encoded:,} submaps in {report.encoding_s:.1f} s, {report.submaps_per_s:,.1f} a second",
+            f"{report.submaps_encoded:,} submaps in {report.encoding_s:.1f} s, {report.submaps_per_s:,.1f} a second",
         ),
         ("writing", f"{report.writing_s:.1f} s"),
     ]

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from crossloc3d_ros.aerial_map.builder import read_headers
+from crossloc3d_ros.aerial_map.survey import read_survey
 from crossloc3d_ros.cli.common import add_verbosity, console, run, set_up_logging
 from crossloc3d_ros.errors import AerialDataError
-from crossloc3d_ros.formats.las import LazWriter, expand_inputs, iter_chunks
+from crossloc3d_ros.formats.las import LazWriter, iter_chunks
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,12 +39,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def _cut(arguments: argparse.Namespace) -> None:
     set_up_logging(arguments.verbose, console())
-    headers = read_headers(expand_inputs(arguments.files), arguments.crs)
+    survey = read_survey(arguments.files, arguments.crs)
     west, south, east, north = arguments.bounds or (-np.inf, -np.inf, np.inf, np.inf)
-    offset = np.floor(np.min([header.minimum for header in headers], axis=0))
     kept = 0
-    with LazWriter(arguments.output, headers[0].crs, scale=arguments.scale, offset=offset) as writer:
-        for header in headers:
+    with LazWriter(arguments.output, survey.crs, scale=arguments.scale, offset=np.floor(survey.minimum)) as writer:
+        for header in survey.headers:
             for chunk in iter_chunks(header.path):
                 e, n = chunk.points[:, 0], chunk.points[:, 1]
                 inside = (e >= west) & (e < east) & (n >= south) & (n < north)
@@ -52,7 +51,7 @@ def _cut(arguments: argparse.Namespace) -> None:
                 kept += int(inside.sum())
         if kept == 0:
             raise AerialDataError("none of the files has a point within these bounds; nothing was written")
-    print(f"{arguments.output}: {kept:,} points, {arguments.output.stat().st_size / 1e6:.2f} MB, {headers[0].crs}")
+    print(f"{arguments.output}: {kept:,} points, {arguments.output.stat().st_size / 1e6:.2f} MB, {survey.crs}")
 
 
 if __name__ == "__main__":

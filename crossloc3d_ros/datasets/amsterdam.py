@@ -1,6 +1,6 @@
 """The Amsterdam benchmark: a map of the real survey of 2010, a simulated lidar in the real survey of 2014.
 
-The submaps are those of `build_map` itself, which is given an encoder that keeps the patches. The queries are the
+The submaps are cut as `build_map` cuts them. The queries are the
 demo's drive, and scans spread over all streets of the survey, which say more than one drive does.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from crossloc3d_ros.aerial_map.builder import build_map
-from crossloc3d_ros.aerial_map.store import AerialMap, sha256
+from crossloc3d_ros.aerial_map.aerial_patches import cut_aerial
+from crossloc3d_ros.aerial_map.store import sha256
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, ScanConfig, to_dict
@@ -29,7 +29,7 @@ from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
 from crossloc3d_ros.simulation.world import World
-from crossloc3d_ros.types import Float32Array, Float64Array
+from crossloc3d_ros.types import Float64Array
 
 VERSION = 1
 MAP_SURVEY, DRIVE_SURVEY = "ahn2_2010.laz", "ahn3_2014.laz"
@@ -60,31 +60,6 @@ class AmsterdamBenchmark:
 
 
 AMSTERDAM = AmsterdamBenchmark()
-
-
-class PatchKeeper:
-    """An encoder that keeps what it is given; its descriptors are the patches' numbers."""
-
-    fingerprint = "patch-keeper"
-    descriptor_size = 1
-
-    def __init__(self, preprocessing: PreprocessingConfig) -> None:
-        self.preprocessing = preprocessing
-        self.patches: list[Float32Array] = []
-
-    def encode(self, points: Float32Array) -> Float32Array:
-        """Keep one patch."""
-        row: Float32Array = self.encode_batch([points])[0]
-        return row
-
-    def encode_batch(self, clouds: Sequence[Float32Array]) -> Float32Array:
-        """Keep the patches and return their numbers (B, 1), exact in float32 for any map that fits into memory."""
-        first = len(self.patches)
-        self.patches.extend(clouds)
-        return np.arange(first, len(self.patches), dtype=np.float32)[:, None]
-
-    def warm_up(self) -> None:
-        """Nothing is slow."""
 
 
 def settings_of(benchmark: AmsterdamBenchmark, surveys: Path, preprocessing: PreprocessingConfig) -> dict[str, Any]:
@@ -130,24 +105,22 @@ def built_submaps(
     surveys: Sequence[Path], config: BuildConfig, preprocessing: PreprocessingConfig, work: Path, report: Progress
 ) -> tuple[PlaceSet, str]:
     """Return the submaps that `build_map` makes of surveys, in the map's grid frame, and the map's CRS."""
-    keeper = PatchKeeper(preprocessing)
     with tempfile.TemporaryDirectory(dir=work) as folder:
-        build_map(
+        cut = cut_aerial(
             surveys,
-            Path(folder) / "map",
-            keeper,
-            dataclasses.replace(config, workers=1),  # the patches are kept in this process
-            progress=lambda p: report("cutting" if p.stage == "encoding" else p.stage, p.done, p.total, p.unit),
+            Path(folder) / "submaps",
+            config,
+            preprocessing,
+            progress=lambda p: report(p.stage, p.done, p.total, p.unit),
         )
-        built = AerialMap.load(Path(folder) / "map")
-    numbers = built.index.descriptors(np.arange(len(built.index)))[:, 0].astype(np.int64)
+        patches = cut.patches(np.arange(len(cut)))
     places = PlaceSet(
-        [keeper.patches[number] for number in numbers],
-        np.zeros(len(numbers), np.int64),
-        np.ascontiguousarray(built.submaps.grid[:, :2]),
-        np.zeros(len(numbers)),
+        list(patches),
+        np.zeros(len(cut), np.int64),
+        np.ascontiguousarray(cut.grid[:, :2]),
+        np.zeros(len(cut)),
     )
-    return places, built.manifest.crs
+    return places, cut.crs
 
 
 def raw_drive(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:

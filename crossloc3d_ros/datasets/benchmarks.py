@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.datasets import amsterdam, simulated
@@ -18,7 +18,6 @@ from crossloc3d_ros.datasets.place_sets import EvaluationSet, join_sets, load_se
 from crossloc3d_ros.datasets.simulated import SIMULATED, SIMULATED_SMALL, BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.files import lock
-from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import open_workers
 
 _log = logging.getLogger(__name__)
@@ -138,14 +137,9 @@ def without_encoder(
     advance: Callable[[int], None],
 ) -> None:
     """Do tasks that need no encoder, in so many processes; `advance` is told of each that is done."""
-    nobody = cast(DescriptorEncoder, None)
-    with open_workers(_no_encoder, nobody, workers, None, folder) as pool:
+    with open_workers(None, None, workers, None, folder) as pool:
         for _ in pool.run(make, ((task, 1) for task in tasks), advance):
             pass
-
-
-def _no_encoder() -> DescriptorEncoder:
-    raise AssertionError("towns are made without an encoder")
 
 
 def _current(folder: Path, settings: dict[str, Any]) -> EvaluationSet | None:

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from crossloc3d_ros import __version__
 from crossloc3d_ros.aerial_map.aerial_patches import AerialPatches, cut_aerial
-from crossloc3d_ros.aerial_map.builder import read_headers
+from crossloc3d_ros.aerial_map.survey import read_survey
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import BuildConfig, DatasetConfig, PreprocessingConfig, ScanConfig, to_dict
 from crossloc3d_ros.datasets.recordings import RecordedScans, Topics, find_topics, read_scans
@@ -50,7 +50,7 @@ NO_SUBMAP = "no submap of the survey near"
 BORDER = "across the border of two areas"
 _DIAGONAL = math.sqrt(2.0)
 _AT_ONCE = 256
-_WORK_VERSION = 1
+_WORK_VERSION = 2
 
 Progress = Callable[[str, float, float, str], None]
 """Stage, done, total, unit."""
@@ -121,9 +121,7 @@ def make_dataset(request: DatasetRequest, progress: Progress | None = None) -> D
                 request.survey, work / "aerial", request.build, request.preprocessing, crs=request.crs,
                 progress=lambda p: show(p.stage, p.done, p.total, p.unit),
             )  # fmt: skip
-            recordings = [
-                _recorded(work, number, request, aerial.manifest.crs, show) for number in range(len(request.bags))
-            ]
+            recordings = [_recorded(work, number, request, aerial.crs, show) for number in range(len(request.bags))]
             report = _Dataset(request, aerial, recordings).write(work / "dataset", show)
             (work / "dataset").rename(request.output)  # which does not exist, or is an empty folder
             shutil.rmtree(work, ignore_errors=True)
@@ -264,7 +262,7 @@ class _Dataset:
             recordings.append(RecordingReport(name, scans.seen, used, dropped, scans.topics, scans.damage))
         return DatasetReport(
             output=self.request.output,
-            crs=self.aerial.manifest.crs,
+            crs=self.aerial.crs,
             scans=_counts(self.scan_roles, (TRAINING, VALIDATION, TEST)),
             submaps=_counts(self.submap_roles, (TRAINING, VALIDATION, TEST, NONE)),
             recordings=tuple(recordings),
@@ -285,7 +283,7 @@ class _Dataset:
             "submaps": {role or BORDER: count for role, count in report.submaps.items()},
             "recordings": [vars(recording) for recording in report.recordings],
             "ground_database": [path.name for path in request.database_bags],
-            "survey": [vars(source) for source in self.aerial.manifest.sources],
+            "survey": [vars(source) for source in self.aerial.sources],
             "settings": to_dict(request.config),
             "scan": to_dict(request.scan),
             "preprocessing": to_dict(preprocessing),
@@ -301,12 +299,12 @@ class _Dataset:
                     reasons[reason] = reasons.get(reason, 0) + count
             why = "; ".join(f"{count:,} {reason}" for reason, count in sorted(reasons.items(), key=lambda r: -r[1]))
             return f"none of the {seen:,} scans can be used: {why or 'the recordings hold none'}"
-        west, south, east, north = self.aerial.manifest.bounds
+        west, south, east, north = self.aerial.bounds
         x, y = np.median(self.scans.xy_m, axis=0)
         return (
             f"none of the {len(self.scans):,} scans lies within {self.request.config.positive_m:g} m of a submap: they "
             f"were taken around {x:.0f}, {y:.0f} and the survey covers {west:.0f} to {east:.0f}, {south:.0f} to "
-            f"{north:.0f} ({self.aerial.manifest.crs}); is it the survey of that place, and its CRS the right one?"
+            f"{north:.0f} ({self.aerial.crs}); is it the survey of that place, and its CRS the right one?"
         )
 
 
@@ -344,7 +342,7 @@ def _check(request: DatasetRequest) -> None:
     for path in request.bags:
         with open_bag(path) as bag:
             find_topics(bag, request.topics)
-    read_headers(expand_inputs(request.survey), request.crs)
+    read_survey(request.survey, request.crs)
 
 
 def _job(request: DatasetRequest) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import multiprocessing
+import os
 import shutil
 import time
 from collections.abc import Callable
@@ -17,7 +18,8 @@ import pyproj
 import pytest
 
 from crossloc3d_ros.aerial_map import builder, spool, store, tile
-from crossloc3d_ros.aerial_map.builder import BuildProgress, build_map, work_folder
+from crossloc3d_ros.aerial_map.builder import build_map, work_folder
+from crossloc3d_ros.aerial_map.progress import BuildProgress
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.clouds.tiling import cut_submap, submap_centres
 from crossloc3d_ros.config import BuildConfig
@@ -309,7 +311,7 @@ def test_a_stopped_build_goes_on_to_the_same_map(
     if stop_at > 1:
         assert report.points_read == 0
     if stop_at >= 5:
-        assert encoder.calls - before == report.places_encoded < report.manifest.counts.submaps
+        assert encoder.calls - before == report.submaps_encoded < report.manifest.counts.submaps
 
 
 def _build_slowly(survey_file: Path, output: Path, encoder: Any, config: BuildConfig) -> None:
@@ -456,7 +458,7 @@ def test_a_full_disk_is_said_and_loses_nothing(
     assert not (tmp_path / "town").exists()
     report = build_map([survey_file], tmp_path / "town", encoder, small_tiles)
     assert report.resumed
-    assert report.places_encoded < report.manifest.counts.submaps or where == "spool"
+    assert report.submaps_encoded < report.manifest.counts.submaps or where == "spool"
     assert contents(tmp_path / "town") == contents(built)
 
 
@@ -464,7 +466,7 @@ def test_too_small_a_disk_is_said_before_the_work(
     tmp_path: Path, survey_file: Path, encoder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(builder.shutil, "disk_usage", lambda _: real._replace(free=1_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: real._replace(free=1_000_000))
     with pytest.raises(MapError, match=r"too little room: the build needs about [\d.]+ MB there and 1 MB is free"):
         build_map([survey_file], tmp_path / "map", encoder)
     assert encoder.calls == 0 and not (tmp_path / "map").exists()
@@ -513,3 +515,59 @@ def test_settings_that_do_not_fit_are_refused(tmp_path: Path, survey_file: Path,
 def test_coordinates_that_do_not_fit_the_crs_are_refused(tmp_path: Path, survey_file: Path, encoder: Any) -> None:
     with pytest.raises(AerialDataError, match="do not fit the CRS"):
         build_map([survey_file], tmp_path / "map", encoder, crs="EPSG:4326")
+
+
+def test_a_second_build_is_refused_by_name_and_touches_nothing(
+    tmp_path: Path, survey_file: Path, encoder: Any, small_tiles: BuildConfig, built: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Neither checks of the disk or the inputs nor the undoing of a killed replacement come before the lock."""
+    output, replaced = tmp_path / "map", tmp_path / ".map.replaced"
+    shutil.copytree(built, output)
+    refused = 0
+
+    def no_encoder() -> Any:
+        pytest.fail("the second build loads its encoder")
+
+    def build_again(progress: BuildProgress) -> None:
+        nonlocal refused
+        if progress.stage != "encoding":
+            return
+        output.rename(replaced)  # as between the two renames of the first build
+        with monkeypatch.context() as patch, pytest.raises(MapError, match=rf"another build works .*{os.getpid()} on"):
+            patch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 0))
+            build_map([tmp_path / "missing.laz"], output, no_encoder, small_tiles, overwrite=True)
+        assert not output.exists()
+        replaced.rename(output)
+        refused += 1
+
+    build_map([survey_file], output, encoder, small_tiles, overwrite=True, progress=build_again)
+    assert refused > 2
+    assert contents(output) == contents(built)
+
+
+def test_a_file_that_vanishes_while_the_work_is_sized_does_not_end_the_build(
+    tmp_path: Path, survey_file: Path, encoder: Any, small_tiles: BuildConfig, built: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    interrupt_while_encoding([survey_file], tmp_path / "map", encoder, small_tiles)
+    lost = next((work_folder(tmp_path / "map") / "tiles").glob("*.npz"))
+    stat = Path.stat
+
+    def stat_and_lose(path: Path, **options: Any) -> os.stat_result:
+        found = stat(path, **options)
+        if path == lost:
+            path.unlink()
+        return found
+
+    monkeypatch.setattr(Path, "stat", stat_and_lose)
+    assert build_map([survey_file], tmp_path / "map", encoder, small_tiles).resumed
+    assert contents(tmp_path / "map") == contents(built)
+
+
+def test_a_build_that_is_refused_leaves_no_work(tmp_path: Path, survey_file: Path, encoder: Any, built: Path) -> None:
+    with pytest.raises(AerialDataError, match="no such file"):
+        build_map([tmp_path / "missing.laz"], tmp_path / "map", encoder)
+    with pytest.raises(ConfigError):
+        build_map([survey_file], tmp_path / "map", encoder, BuildConfig(tile_m=380.0, cell_m=0.7))
+    assert list(tmp_path.iterdir()) == []

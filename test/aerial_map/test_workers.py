@@ -17,7 +17,8 @@ import psutil
 import pytest
 
 from crossloc3d_ros.aerial_map import store
-from crossloc3d_ros.aerial_map.builder import BuildProgress, build_map, work_folder
+from crossloc3d_ros.aerial_map.builder import build_map, work_folder
+from crossloc3d_ros.aerial_map.progress import BuildProgress
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder

@@ -12,7 +12,7 @@ import pytest
 from crossloc3d_ros.cli.demo import DemoDrive
 from crossloc3d_ros.config import BuildConfig, PlacesConfig, PreprocessingConfig
 from crossloc3d_ros.datasets import benchmarks
-from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, PatchKeeper, built_submaps
+from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, built_submaps
 from crossloc3d_ros.datasets.benchmarks import open_benchmark
 from crossloc3d_ros.datasets.simulated import (
     HELD_OUT,
@@ -168,11 +168,3 @@ def test_bad_requests_are_told(tmp_path: Path) -> None:
         open_benchmark("amsterdam", tmp_path, PREPROCESSING, surveys=tmp_path)
     with pytest.raises(EvaluationError, match="needs the folder"):
         open_benchmark("amsterdam", tmp_path, PREPROCESSING)
-
-
-def test_the_patch_keeper_numbers_what_it_keeps() -> None:
-    keeper = PatchKeeper(PREPROCESSING)
-    clouds = [np.full((3, 3), i, np.float32) for i in range(5)]
-    assert keeper.encode_batch(clouds[:3]).tolist() == [[0], [1], [2]]
-    assert keeper.encode(clouds[3]).tolist() == [3]
-    assert [patch[0, 0] for patch in keeper.patches] == [0, 1, 2, 3]

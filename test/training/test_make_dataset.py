@@ -177,7 +177,7 @@ def test_an_interrupted_call_goes_on_and_gives_the_same(
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the survey and the recordings were read again")
 
-    monkeypatch.setattr(aerial_patches, "build_map", never)
+    monkeypatch.setattr(aerial_patches, "build_tiles", never)
     monkeypatch.setattr(module, "read_scans", never)
     make_dataset(request)
     names = sorted(str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file())
