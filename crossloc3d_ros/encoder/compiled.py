@@ -16,9 +16,16 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from torch import Tensor, nn
 
-from crossloc3d_ros.encoder import stages
-from crossloc3d_ros.encoder.kernels import COLUMNS, dense_product, kernel_map, pack_weights
-from crossloc3d_ros.encoder.model import ConvolutionNorm, CrossLoc3D, Grain, PositionEmbedding, RefinementLayer
+from crossloc3d_ros.encoder import sites, stages
+from crossloc3d_ros.encoder.kernels import COLUMNS, dense_product, pack_weights
+from crossloc3d_ros.encoder.model import (
+    ConvolutionNorm,
+    CrossLoc3D,
+    Grain,
+    PositionEmbedding,
+    RefinementLayer,
+    SelectionBlock,
+)
 from crossloc3d_ros.types import Float32Array, Int32Array, Int64Array
 
 MIN_ROWS_TO_SHARE = 256
@@ -32,6 +39,7 @@ class _Layer(NamedTuple):
     """Packed for the kernels: (K^3, Cout / 16, Cin, 16), or without the first axis for K = 1."""
     shift: Float32Array
     """(Cout,)."""
+    kernel_size: int = 1
 
 
 class CompiledModel:
@@ -159,11 +167,13 @@ class Team:
 class _Pairs:
     """A kernel map, with each thread's share of every kernel's pairs."""
 
-    def __init__(self, sites: Int32Array, output: Int32Array, kernel_size: int, stride: int, team: Team) -> None:
-        starts, output_starts = np.array([0, len(sites)]), np.array([0, len(output)])
-        self.in_rows, self.out_rows, first = kernel_map(sites, starts, output, output_starts, kernel_size, stride)
-        self.n_rows = len(output)
-        rows, begin, end = stages.split_pairs(self.out_rows, first, self.n_rows, team.parts(self.n_rows))
+    def __init__(self, inputs: Int32Array, outputs: Int32Array, kernel_size: int, stride: int, team: Team) -> None:
+        starts, output_starts = np.array([0, len(inputs)]), np.array([0, len(outputs)])
+        self.in_rows, self.out_rows, first = sites.kernel_map(
+            inputs, starts, outputs, output_starts, kernel_size, stride
+        )
+        self.n_rows = len(outputs)
+        rows, begin, end = sites.split_pairs(self.out_rows, first, self.n_rows, team.parts(self.n_rows))
         self.shares: list[tuple[Int64Array, Int64Array, int, int]] = [
             (begin[part], end[part], int(rows[part]), int(rows[part + 1])) for part in range(len(begin))
         ]
@@ -186,16 +196,20 @@ class _Pairs:
         return out
 
 
+_WIDE_KERNELS = {size for sizes in SelectionBlock.KERNELS for size in sizes if size > 1}
+"""Kernel sizes that need a kernel map: every branch ends in one."""
+
+
 class _FoldedGrain:
     def __init__(self, grain: Grain) -> None:
         block = grain.selection
         self._voxel_size = np.float32(grain.voxel_size)
         weights, self._stem_shift = _folded(grain.stem)
-        self._stem = np.ascontiguousarray(weights[:, 0])  # (125, C)
+        self._stem = np.ascontiguousarray(weights[:, 0])  # (K^3, C)
+        self._stem_size = grain.stem.kernel_size
         self._down = _layer(grain.down)
         self._position = None if grain.position is None else _FoldedPosition(grain.position, grain.voxel_size)
-        branches = [[_layer(cast(ConvolutionNorm, m)) for m in cast(nn.ModuleList, b)] for b in block.branches]
-        _, self._b1, self._b2, self._b3, self._b4 = branches
+        self._branches = [[_layer(cast(ConvolutionNorm, m)) for m in cast(nn.ModuleList, b)] for b in block.branches]
         self._attention = np.stack([_array(cast(Any, a).conv.weight).reshape(3) for a in block.attentions])
         self._kept = block.kept
         if block.kept:
@@ -212,25 +226,26 @@ class _FoldedGrain:
 
     def encode(self, points: Float32Array, team: Team) -> Float32Array:
         """Return the grain's features (N, C) on the sites of stride 2."""
-        sites = stages.voxels(points, self._voxel_size)
-        coarse = stages.coarser(sites)
-        fine = _rows(self._stem_shift, len(sites))
-        team.share(len(sites), stages.stem, *stages.occupancy(sites, 5), self._stem, fine)
+        fine = sites.voxels(points, self._voxel_size)
+        coarse = sites.coarser(fine)
+        y = _rows(self._stem_shift, len(fine))
+        team.share(len(fine), stages.stem, *sites.occupancy(fine, self._stem_size), self._stem, y)
         places = None if self._position is None else self._position.embed(coarse)
-        x = _Pairs(sites, coarse, 3, 1, team).convolve(fine, self._down, team, relu=True, added=places)
-        near, far = _Pairs(coarse, coarse, 3, 2, team), _Pairs(coarse, coarse, 5, 2, team)
-        branches = np.empty((5, *x.shape), np.float32)
-        branches[0] = x
-        (first, second), out = self._b1, branches[1]
-        near.convolve(_dense_relu(x, first, team), second, team, relu=False, out=out)
-        (first, second), out = self._b2, branches[2]
-        near.convolve(near.convolve(x, first, team, relu=True), second, team, relu=False, out=out)
-        (first, second, third), out = self._b3, branches[3]
-        y = far.convolve(_dense_relu(x, first, team), second, team, relu=True)
-        near.convolve(y, third, team, relu=False, out=out)
-        (first, second, third), out = self._b4, branches[4]
-        y = far.convolve(_dense_relu(x, first, team), second, team, relu=True)
-        far.convolve(y, third, team, relu=False, out=out)
+        x = _Pairs(fine, coarse, self._down.kernel_size, 1, team).convolve(y, self._down, team, relu=True, added=places)
+        pairs = {size: _Pairs(coarse, coarse, size, 2, team) for size in _WIDE_KERNELS}
+        branches = np.empty((len(self._branches), *x.shape), np.float32)
+        for layers, out in zip(self._branches, branches, strict=True):
+            y = x
+            for layer in layers[:-1]:
+                y = (
+                    _dense_relu(y, layer, team)
+                    if layer.kernel_size == 1
+                    else pairs[layer.kernel_size].convolve(y, layer, team, relu=True)
+                )
+            if layers:  # no ReLU at a branch's end
+                pairs[layers[-1].kernel_size].convolve(y, layers[-1], team, relu=False, out=out)
+            else:
+                out[:] = x
         scales = stages.channel_attention(branches, self._attention)
         if not self._kept:
             mean: Float32Array = (branches * scales[:, None]).mean(axis=0)
@@ -248,18 +263,18 @@ class _FoldedPosition:
         self._voxel_size = voxel_size
         self._weights = _array(position.linear.weight).T.reshape(-1, position.axes, position.linear.out_features)
 
-    def embed(self, sites: Int32Array) -> Float32Array:
-        """Return (N, C) for sites (N, 3) of stride 2."""
+    def embed(self, coarse: Int32Array) -> Float32Array:
+        """Return (N, C) for sites `coarse` (N, 3) of stride 2."""
         if self._kind == "radial":
-            x, y = ((sites[:, axis] + 1.0) * self._voxel_size for axis in range(2))
+            x, y = ((coarse[:, axis] + 1.0) * self._voxel_size for axis in range(2))
             distances, rows = np.unique(np.hypot(x, y).astype(np.float32), return_inverse=True)
-            return self._axis(distances, 0)[rows] + self._on_grid(sites[:, 2], 1)
-        return self._on_grid(sites[:, 0], 0) + self._on_grid(sites[:, 1], 1) + self._on_grid(sites[:, 2], 2)
+            return self._axis(distances, 0)[rows] + self._on_grid(coarse[:, 2], 1)
+        return self._on_grid(coarse[:, 0], 0) + self._on_grid(coarse[:, 1], 1) + self._on_grid(coarse[:, 2], 2)
 
-    def _on_grid(self, sites: Int32Array, axis: int) -> Float32Array:
-        low = int(sites.min())
-        centres = (np.arange(low, int(sites.max()) + 1) + 1.0) * self._voxel_size
-        table: Float32Array = self._axis(centres.astype(np.float32), axis)[sites - low]
+    def _on_grid(self, coordinates: Int32Array, axis: int) -> Float32Array:
+        low = int(coordinates.min())
+        centres = (np.arange(low, int(coordinates.max()) + 1) + 1.0) * self._voxel_size
+        table: Float32Array = self._axis(centres.astype(np.float32), axis)[coordinates - low]
         return table
 
     def _axis(self, values: Float32Array, axis: int) -> Float32Array:
@@ -326,7 +341,7 @@ def _folded(layer: ConvolutionNorm) -> tuple[Float32Array, Float32Array]:
 def _layer(layer: ConvolutionNorm) -> _Layer:
     weights, shift = _folded(layer)
     packed = pack_weights(weights)
-    return _Layer(packed[0] if layer.kernel_size == 1 else packed, shift)
+    return _Layer(packed[0] if layer.kernel_size == 1 else packed, shift, layer.kernel_size)
 
 
 def _packed(weights: Float32Array) -> Float32Array:

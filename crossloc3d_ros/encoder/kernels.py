@@ -1,4 +1,4 @@
-"""The CPU kernels of the sparse network, compiled by Numba: kernel maps and the gathered matrix product.
+"""The CPU kernel of the sparse network, compiled by Numba: the gathered matrix product.
 
 Everything here works on plain NumPy arrays, releases the GIL and starts no threads of its own: whoever calls may run
 one kernel on several row ranges at once from several threads.
@@ -27,9 +27,6 @@ UNROLL = 4
 
 OUTER_BLOCK = 64
 """Pairs that the gradient of the weights takes at a time, so that both sides stay in the cache."""
-
-MAX_DENSE_CELLS = 1 << 24
-"""Largest bounding box (in cells) that is looked up in a dense table; beyond it sorted keys are searched."""
 
 
 def _make_tile(n_rows: int, *, gathered: bool) -> Any:
@@ -243,128 +240,3 @@ def gather_outer(x: Any, grad: Any, in_rows: Any, out_rows: Any, first: Any, out
                 0,
                 depth,
             )
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def _fill_table(coords: Any, low: Any, shape: Any, table: Any, begin: int, end: int) -> None:
-    for n in range(begin, end):
-        cell = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (coords[n, 0] - low[0])
-        table[cell] = n
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def widen(coords: Any, begin: int, end: int, low: Any, high: Any) -> None:
-    """Widen the box from low to high (3,) so that it holds coords[begin:end]."""
-    for n in range(begin, end):
-        for axis in range(3):
-            low[axis] = min(low[axis], coords[n, axis])
-            high[axis] = max(high[axis], coords[n, axis])
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def lower_bound(keys: Any, wanted: int) -> int:
-    """Return the first position in sorted keys that is not below `wanted` (NumPy's own compiles for seconds)."""
-    low, high = 0, len(keys)
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def find_key(keys: Any, wanted: int) -> int:
-    """Return the position of `wanted` in sorted keys, or -1."""
-    at = lower_bound(keys, wanted)
-    return at if at < len(keys) and keys[at] == wanted else -1
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel_size: int, step: int) -> Any:
-    """Find for every output site its input neighbours.
-
-    coords (N, 3) and queries (M, 3) int32 hold x, y, z of the input and output sites, cloud by cloud as `starts` and
-    `query_starts` (B + 1,) say, each cloud's sorted by z, then y, then x. Kernel index k = ix + K iy + K^2 iz, offset
-    (ix - K // 2, ...) times `step`.
-    Returns in_rows (P,), out_rows (P,) int32, sorted by kernel and then by output row, and first (K^3 + 1,) int64,
-    where each kernel's pairs begin.
-    """
-    radius = (kernel_size // 2) * step
-    n_kernels = kernel_size**3
-    n_clouds = len(starts) - 1
-    n_queries = len(queries)
-    found = np.full((n_kernels, n_queries), -1, np.int32)
-    first = np.zeros(n_kernels + 1, np.int64)
-    low = np.empty(3, np.int64)
-    high = np.empty(3, np.int64)
-    shape = np.empty(3, np.int64)
-    table = np.empty(0, np.int32)
-    for cloud in range(n_clouds):
-        begin, end = starts[cloud], starts[cloud + 1]
-        query_begin, query_end = query_starts[cloud], query_starts[cloud + 1]
-        if begin == end or query_begin == query_end:
-            continue
-        low[:] = coords[begin]
-        high[:] = coords[begin]
-        widen(coords, begin, end, low, high)
-        widen(queries, query_begin, query_end, low, high)
-        for axis in range(3):
-            low[axis] -= radius
-            shape[axis] = high[axis] + radius - low[axis] + 1
-        cells = shape[0] * shape[1] * shape[2]
-        dense = float(shape[0]) * float(shape[1]) * float(shape[2]) <= MAX_DENSE_CELLS
-        if dense and cells > len(table):
-            table = np.full(cells, -1, np.int32)
-        keys = np.empty(end - begin, np.int64)
-        if dense:
-            _fill_table(coords, low, shape, table, begin, end)
-        else:
-            for n in range(begin, end):
-                keys[n - begin] = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (
-                    coords[n, 0] - low[0]
-                )
-        base = np.empty(query_end - query_begin, np.int64)
-        for m in range(query_begin, query_end):
-            base[m - query_begin] = ((queries[m, 2] - low[2]) * shape[1] + (queries[m, 1] - low[1])) * shape[0] + (
-                queries[m, 0] - low[0]
-            )
-        k = 0
-        for iz in range(-radius, radius + 1, step):
-            for iy in range(-radius, radius + 1, step):
-                for ix in range(-radius, radius + 1, step):
-                    delta = (iz * shape[1] + iy) * shape[0] + ix
-                    count = 0
-                    if dense:
-                        for m in range(query_end - query_begin):
-                            n = table[base[m] + delta]
-                            found[k, query_begin + m] = n
-                            count += n >= 0
-                    else:
-                        for m in range(query_end - query_begin):
-                            at = find_key(keys, base[m] + delta)
-                            if at >= 0:
-                                found[k, query_begin + m] = begin + at
-                                count += 1
-                    first[k + 1] += count
-                    k += 1
-        if dense:
-            for n in range(begin, end):
-                cell = ((coords[n, 2] - low[2]) * shape[1] + (coords[n, 1] - low[1])) * shape[0] + (
-                    coords[n, 0] - low[0]
-                )
-                table[cell] = -1
-    for k in range(n_kernels):
-        first[k + 1] += first[k]
-    in_rows = np.empty(first[n_kernels], np.int32)
-    out_rows = np.empty(first[n_kernels], np.int32)
-    p = 0
-    for k in range(n_kernels):
-        for m in range(n_queries):
-            n = found[k, m]
-            if n >= 0:
-                in_rows[p] = n
-                out_rows[p] = m
-                p += 1
-    return in_rows, out_rows, first

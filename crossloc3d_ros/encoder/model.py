@@ -1,8 +1,23 @@
 """The CrossLoc3D network (ICCV 2023), top to bottom: grains, selection, iterative refinement, fusion, NetVLAD.
 
-One encoder a grain (voxel size) turns the cloud into features on a sparse grid; external attention refines them from
-grain to grain; NetVLAD pools them into one descriptor. Every sum over a cloud runs over that cloud's own sites, so a
-descriptor does not depend on the others of its batch.
+| the paper's network figure | here |
+|---|---|
+| multi-grained voxelization into V_1 (fine) to V_L (coarse), L grains | `voxelize`, a `Grain` for each voxel size |
+| multi-scale sparse convolution with the kernel sizes k_s, s the scale | `SelectionBlock.KERNELS`, a branch a scale |
+| feature selection: K scales are kept, F^_l is what remains of V_l | `SelectionBlock`, `kept_branches` |
+| iterative refinement from F^_L to F^_1 | `Refinement`, of `RefinementLayer`s, `sub_steps` a grain |
+| time T_l and its embedding e(t) | `TimeEmbedding` |
+| fused features F- | `CrossLoc3D.fusion` of the stages that `Refinement` returns |
+| NetVLAD and the global descriptor F_g | `NetVlad` |
+
+Where it leaves the figure, following the code that its authors released, or for a reason of its own:
+
+* Order of t: it counts the layers, from 0 at the coarsest grain upwards; every sub-step has its own, not every grain.
+* Gating: what is kept is weighted by a softmax over all scales, for each voxel and channel, without renormalising.
+* Masking instead of indexing: all scales are computed, and those that are not kept count with weight 0.
+* Batches: every sum over a cloud runs over that cloud's own sites instead of clouds padded to one length, so that a
+  descriptor does not depend on the others of its batch.
+* `PositionEmbedding` is not in the paper; without it (the default) the network is the published one.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from crossloc3d_ros.encoder import kernels
+from crossloc3d_ros.encoder.sites import cell_key, kernel_map, key_cell
 
 
 @dataclass(frozen=True)
@@ -80,28 +81,27 @@ def voxelize(clouds: Sequence[Tensor], size: float) -> VoxelGrid:
 
 
 def _unique_sites(coords: Tensor, batch: Tensor, n_clouds: int, stride: int) -> VoxelGrid:
-    """Sort sites by (cloud, z, y, x) through one linear key and drop the duplicates."""
+    """Sort sites by (cloud, z, y, x) and drop the duplicates."""
     wide = coords.to(torch.int64)
     low = wide.amin(dim=0)
     extent = wide.amax(dim=0) - low + 1
-    wide = wide - low
-    key = ((batch * extent[2] + wide[:, 2]) * extent[1] + wide[:, 1]) * extent[0] + wide[:, 0]
-    key = torch.unique(key)
-    x = key % extent[0]
-    rest = key // extent[0]
-    y = rest % extent[1]
-    rest = rest // extent[1]
-    z = rest % extent[2]
-    sites = (torch.stack((x, y, z), dim=1) + low).to(torch.int32)
-    counts = torch.bincount(rest // extent[2], minlength=n_clouds)
+    x, y, layer = key_cell(torch.unique(_batch_keys(wide - low, batch, extent)), extent)
+    sites = (torch.stack((x, y, layer % extent[2]), dim=1) + low).to(torch.int32)
+    counts = torch.bincount(layer // extent[2], minlength=n_clouds)
     starts = torch.zeros(n_clouds + 1, dtype=torch.int64)
     starts[1:] = torch.cumsum(counts, 0).cpu()
     return VoxelGrid(sites, starts, stride)
 
 
+def _batch_keys(cells: Tensor, batch: Tensor, extent: Tensor) -> Tensor:
+    """Return the keys (N,) of cells (N, 3) int64 where the boxes of all clouds are stacked along z."""
+    key: Tensor = cell_key(cells[:, 0], cells[:, 1], batch * extent[2] + cells[:, 2], extent)
+    return key
+
+
 def _build_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> KernelMap:
     if source.coords.device.type == "cpu":
-        in_rows, out_rows, first = kernels.kernel_map(
+        in_rows, out_rows, first = kernel_map(
             source.coords.numpy(),
             source.starts.numpy(),
             target.coords.numpy(),
@@ -119,12 +119,7 @@ def search_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> Kernel
     radius = kernel_size // 2 * source.stride
     low = torch.minimum(source.coords.amin(0), target.coords.amin(0)).long() - radius
     extent = torch.maximum(source.coords.amax(0), target.coords.amax(0)).long() + radius - low + 1
-
-    def keys(grid: VoxelGrid) -> Tensor:
-        wide = grid.coords.long() - low
-        return ((grid.batch * extent[2] + wide[:, 2]) * extent[1] + wide[:, 1]) * extent[0] + wide[:, 0]
-
-    sorted_keys, queries = keys(source), keys(target)
+    sorted_keys, queries = (_batch_keys(grid.coords.long() - low, grid.batch, extent) for grid in (source, target))
     ins: list[Tensor] = []
     outs: list[Tensor] = []
     first = [0]
@@ -132,7 +127,7 @@ def search_map(source: VoxelGrid, target: VoxelGrid, kernel_size: int) -> Kernel
     for dz in steps:
         for dy in steps:
             for dx in steps:
-                wanted = queries + (dz * extent[1] + dy) * extent[0] + dx
+                wanted = queries + cell_key(dx, dy, dz, extent)
                 at = torch.searchsorted(sorted_keys, wanted).clamp_(max=len(sorted_keys) - 1)
                 hit = torch.nonzero(sorted_keys[at] == wanted).squeeze(1)
                 ins.append(at[hit])

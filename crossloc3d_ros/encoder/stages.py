@@ -11,17 +11,12 @@ from numba.extending import intrinsic
 
 from crossloc3d_ros.encoder.kernels import (
     COLUMNS,
-    MAX_DENSE_CELLS,
     dense_product,
-    find_key,
     gather_product,
-    lower_bound,
     strided_product,
-    widen,
 )
-from crossloc3d_ros.types import Float32Array, Int32Array
+from crossloc3d_ros.encoder.sites import find_key
 
-_exact = njit(cache=True, nogil=True, boundscheck=False)
 _fused = njit(cache=True, nogil=True, boundscheck=False, fastmath={"contract"})
 _loose = njit(cache=True, nogil=True, boundscheck=False, fastmath={"contract", "reassoc", "nsz"})
 
@@ -55,110 +50,6 @@ def _exp(x: Any) -> Any:
     r = x - n * _LN2_HIGH - n * _LN2_LOW
     p = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
     return (p * r * r + r + _ONE) * _as_float(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
-
-
-def unique_sites(coords: Int32Array) -> Int32Array:
-    """Return the distinct rows of coords (n, 3), sorted by z, then y, then x."""
-    low = coords.min(axis=0).astype(np.int64)
-    shape = coords.max(axis=0) - low + 1
-    if float(shape[0]) * float(shape[1]) * float(shape[2]) <= MAX_DENSE_CELLS:
-        sites: Int32Array = _dense_sites(coords, low, shape)
-        return sites
-    x, y, z = (coords - low).T
-    key = np.unique((z * shape[1] + y) * shape[0] + x)
-    rest = key // shape[0]
-    columns = key % shape[0] + low[0], rest % shape[1] + low[1], rest // shape[1] + low[2]
-    return np.stack(columns, axis=1).astype(np.int32)
-
-
-@_exact
-def _dense_sites(coords: Any, low: Any, shape: Any) -> Any:
-    seen = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
-    count = 0
-    for i in range(len(coords)):
-        cell = ((coords[i, 2] - low[2]) * shape[1] + (coords[i, 1] - low[1])) * shape[0] + (coords[i, 0] - low[0])
-        count += not seen[cell]
-        seen[cell] = True
-    sites = np.empty((count, 3), np.int32)
-    count = cell = 0
-    for z in range(shape[2]):
-        for y in range(shape[1]):
-            for x in range(shape[0]):
-                if seen[cell]:
-                    sites[count, 0] = x + low[0]
-                    sites[count, 1] = y + low[1]
-                    sites[count, 2] = z + low[2]
-                    count += 1
-                cell += 1
-    return sites
-
-
-def voxels(points: Float32Array, size: np.float32) -> Int32Array:
-    """Return the sites `floor(x / size)` of points (n, 3) float32, divided in float32; see `sparse.voxelize`."""
-    return unique_sites(np.floor(points / size).astype(np.int32))
-
-
-def coarser(sites: Int32Array) -> Int32Array:
-    """Return the sites of stride 2: the distinct `floor(c / 2) * 2`."""
-    return unique_sites(sites & ~1)
-
-
-@_exact
-def split_pairs(out_rows: Any, first: Any, n_rows: int, parts: int) -> Any:
-    """Share the pairs of a kernel map out by output row, so that every part has about as many pairs.
-
-    Returns rows (parts + 1,), where each part's output rows begin, and begin, end (parts, K), its pairs of kernel k.
-    """
-    load = np.zeros(n_rows + 1, np.int64)
-    for row in out_rows:
-        load[row + 1] += 1
-    for row in range(n_rows):
-        load[row + 1] += load[row]
-    rows = np.zeros(parts + 1, np.int64)
-    for part in range(1, parts):
-        rows[part] = lower_bound(load, len(out_rows) * part // parts)
-    rows[parts] = n_rows
-    kernels = len(first) - 1
-    begin = np.empty((parts, kernels), np.int64)
-    end = np.empty((parts, kernels), np.int64)
-    for k in range(kernels):
-        at = first[k]
-        for part in range(parts):
-            begin[part, k] = at
-            at = first[k] + lower_bound(out_rows[first[k] : first[k + 1]], rows[part + 1])
-            end[part, k] = at
-    return rows, begin, end
-
-
-@_exact
-def occupancy(sites: Any, kernel_size: int) -> Any:
-    """Return a padded table of occupied cells, each site's place in it, and the steps to its neighbours.
-
-    The table is (cells,) bool, the places (N,) int64, the steps (K^3,) int64 in kernel order; where the box is too
-    large for a table, the table is empty.
-    """
-    radius = kernel_size // 2
-    low = sites[0].astype(np.int64)
-    high = low.copy()
-    widen(sites, 0, len(sites), low, high)
-    low -= radius
-    shape = high + radius - low + 1
-    steps = np.empty(kernel_size**3, np.int64)
-    k = 0
-    for iz in range(-radius, radius + 1):
-        for iy in range(-radius, radius + 1):
-            for ix in range(-radius, radius + 1):
-                steps[k] = (iz * shape[1] + iy) * shape[0] + ix
-                k += 1
-    places = np.empty(len(sites), np.int64)
-    for i in range(len(sites)):
-        places[i] = ((sites[i, 2] - low[2]) * shape[1] + (sites[i, 1] - low[1])) * shape[0] + (sites[i, 0] - low[0])
-    if float(shape[0]) * float(shape[1]) * float(shape[2]) > MAX_DENSE_CELLS:
-        return np.zeros(0, np.bool_), places, steps
-    table = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
-    for place in places:
-        table[place] = True
-    return table, places, steps
 
 
 @_loose

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossloc3d_ros.encoder import kernels, stages
+from crossloc3d_ros.encoder import kernels, sites, stages
 from crossloc3d_ros.encoder.sparse import VoxelGrid, search_map, sparse_convolution, voxelize
 
 
@@ -23,13 +23,13 @@ def test_voxels_are_the_distinct_floors_of_a_float32_division(size: float) -> No
     grid = voxelize([torch.from_numpy(points)], size)
     assert {tuple(v) for v in grid.coords.tolist()} == expected
     assert len(grid.coords) == len(expected)
-    assert np.array_equal(stages.voxels(points, np.float32(size)), grid.coords.numpy())
+    assert np.array_equal(sites.voxels(points, np.float32(size)), grid.coords.numpy())
 
 
 def test_the_coarse_grid_floors_negative_numbers() -> None:
     grid = VoxelGrid(torch.tensor([[-3, -1, 0], [3, 1, -2]], dtype=torch.int32), torch.tensor([0, 2]))
     assert {tuple(v) for v in grid.downsample().coords.tolist()} == {(-4, -2, 0), (2, 0, -2)}
-    assert {tuple(v) for v in stages.coarser(grid.coords.numpy()).tolist()} == {(-4, -2, 0), (2, 0, -2)}
+    assert {tuple(v) for v in sites.coarser(grid.coords.numpy()).tolist()} == {(-4, -2, 0), (2, 0, -2)}
 
 
 @pytest.mark.parametrize("kernel_size", [1, 3, 5])
@@ -46,7 +46,7 @@ def test_kernel_maps_agree_with_a_search(kernel_size: int) -> None:
 def test_a_box_too_large_for_a_table_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     grid = voxelize([torch.tensor([[0.0, 0.0, 0.0], [0.001, 0, 0], [900.0, 900, 900], [-900.0, 5, 7]])], 0.001)
     assert grid.kernel_map(3).first == search_map(grid, grid, 3).first
-    assert len(stages.occupancy(grid.coords.numpy(), 3)[0]) == 0
+    assert len(sites.occupancy(grid.coords.numpy(), 3)[0]) == 0
 
 
 @pytest.mark.parametrize("kernel_size", [3, 5])
