@@ -42,7 +42,7 @@ class Workers(Protocol):
     def run(
         self, function: Callable[[Task, Advance | None], Result], tasks: Iterable[tuple[Task, int]], advance: Advance
     ) -> Iterator[Result]:
-        """Yield the results as they come; tasks come with their sizes, of which `advance` is told.
+        """Yield the results as they come; tasks come with their sizes, which `advance` counts.
 
         The tasks are taken from the iterable as they are needed: a state has a million tiles.
         """

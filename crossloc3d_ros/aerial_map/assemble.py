@@ -52,14 +52,25 @@ def write_map(
     advance(1)
     bounds = survey_bounds(built)
     _write_rasters(folder, built, bounds, survey.map_crs, config, advance)
+    origin_height_m = round(float(np.median(ground_heights)), 1)
+    manifest = _manifest(folder, survey, built, encoder, config, geoid_separation_m, bounds, origin_height_m)
+    store.write_manifest(folder, manifest)
+    sync(folder)  # before the rename that publishes it
+    return manifest
+
+
+def _manifest(
+    folder: Path, survey: Survey, built: BuiltTiles, encoder: DescriptorEncoder, config: BuildConfig,
+    geoid_separation_m: float | None, bounds: Bounds, origin_height_m: float,
+) -> Manifest:  # fmt: skip
     sources = source_records(survey, built)
     methods = {source.ground for source in sources}
-    manifest = Manifest(
+    return Manifest(
         crs=survey.map_crs,
         origin=(
             float(round((bounds[0] + bounds[2]) / 2.0)),
             float(round((bounds[1] + bounds[3]) / 2.0)),
-            round(float(np.median(ground_heights)), 1),
+            origin_height_m,
         ),
         bounds=bounds,
         vertical_reference=survey.vertical.name,
@@ -69,15 +80,12 @@ def write_map(
         preprocessing=encoder.preprocessing,
         build=config,
         ground=methods.pop() if len(methods) == 1 else "classes and filter",
-        counts=counts,
+        counts=build_counts(built),
         sources=tuple(sources),
         files=store.file_records(folder),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=f"crossloc3d_ros {__version__}",
     )
-    store.write_manifest(folder, manifest)
-    sync(folder)  # before the rename that publishes it
-    return manifest
 
 
 def check_submaps(counts: BuildCounts, preprocessing: PreprocessingConfig) -> None:
@@ -103,7 +111,7 @@ def survey_bounds(built: BuiltTiles) -> Bounds:
 
 
 def build_counts(built: BuiltTiles) -> BuildCounts:
-    """Return what became of the survey's points and of the places where a submap could be."""
+    """Return what became of the survey's points and of the centres on the submaps' grid."""
     spooled, tiles, stray = built.spooled, built.reports, built.stray_points
     kept = sum(report.points_kept for report in spooled)
     return BuildCounts(

@@ -19,7 +19,7 @@ from crossloc3d_ros.aerial_map.progress import Counter, ProgressCallback
 from crossloc3d_ros.aerial_map.store import Manifest
 from crossloc3d_ros.aerial_map.survey import read_survey
 from crossloc3d_ros.aerial_map.tile import TileTimes
-from crossloc3d_ros.aerial_map.tiles import TileJob, build_tiles, check_config, continue_or_start
+from crossloc3d_ros.aerial_map.tiles import BuiltTiles, TileJob, build_tiles, check_config, continue_or_start
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.errors import MapError
 from crossloc3d_ros.files import publish, restore, work_lock
@@ -71,8 +71,8 @@ def build_map(
 ) -> BuildReport:
     """Build the map folder `output` from aerial files, folders and globs.
 
-    `encoder`: an encoder, or the function that loads one, which several workers need. `crs` replaces what the files
-    say. `geoid_separation_m`: ellipsoidal height minus the survey's height, where somebody knows it. `scheduler`: the
+    `encoder`: an encoder, or the function that loads one, which several workers need. `crs` replaces that of the
+    files. `geoid_separation_m`: ellipsoidal height minus the survey's height, where somebody knows it. `scheduler`: the
     address of a Dask cluster whose machines see inputs and output under the same paths.
 
     Raises AerialDataError for inputs that cannot be used, MapError for an output that cannot be written, ConfigError
@@ -99,6 +99,10 @@ def build_map(
             publish(work / "result", output)
             writing_s = watch.lap()
         shutil.rmtree(work, ignore_errors=True)
+    return _report(output, manifest, resumed, built, writing_s)
+
+
+def _report(output: Path, manifest: Manifest, resumed: bool, built: BuiltTiles, writing_s: float) -> BuildReport:
     return BuildReport(
         output=output,
         manifest=manifest,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +43,7 @@ def write_geotiff(
         "blockxsize": BLOCK, "blockysize": BLOCK, "compress": "deflate", "predictor": 3, "bigtiff": "if_safer",
         "sparse_ok": True,
     }  # fmt: skip
-    windows = [
-        Window(column, row, min(BLOCK, width - column), min(BLOCK, height - row))
-        for row in range(0, height, BLOCK)
-        for column in range(0, width, BLOCK)
-    ]
+    windows = _windows(width, height)
     checksum = 0
     try:
         with rasterio.open(path, "w", **profile) as file:
@@ -61,14 +57,27 @@ def write_geotiff(
                 checksum = zlib.crc32(values.tobytes(), checksum)
                 if not np.isnan(values).all():
                     file.write(values, 1, window=window)
-        with rasterio.open(path) as file:
-            found = 0
-            for window in windows:
-                found = zlib.crc32(file.read(1, window=window).tobytes(), found)
+        found = _checksum(path, windows)
     except RasterioError as error:
         raise OSError(f"{path} could not be written: {error}") from error
     if found != checksum:
         raise OSError(f"{path} was not written whole; is the disk full?")
+
+
+def _windows(width: int, height: int) -> list[Window]:
+    return [
+        Window(column, row, min(BLOCK, width - column), min(BLOCK, height - row))
+        for row in range(0, height, BLOCK)
+        for column in range(0, width, BLOCK)
+    ]
+
+
+def _checksum(path: Path, windows: Sequence[Window]) -> int:
+    checksum = 0
+    with rasterio.open(path) as file:
+        for window in windows:
+            checksum = zlib.crc32(file.read(1, window=window).tobytes(), checksum)
+    return checksum
 
 
 def read_geotiff(path: Path, bounds: Bounds | None = None) -> Raster:

@@ -68,12 +68,12 @@ class SpoolReport:
 
     @property
     def classified(self) -> bool:
-        """Whether the file says by itself which points are ground."""
+        """Whether the file has ground classes."""
         return self.points_ground > 0 and self.points_ground >= _CLASSIFIED_SHARE * self.points_kept
 
 
 def spool_file(task: SpoolTask, advance: Callable[[int], None] | None = None) -> SpoolReport:
-    """Read one file to its end and sort its points into tiles; `advance` is told of points as they are read.
+    """Read one file to its end and sort its points into tiles; `advance` counts the points read.
 
     Noise (classes 7 and 18), withheld points and coordinates off the Earth are dropped and counted.
     """

@@ -1,4 +1,4 @@
-"""The aerial map on disk: a folder that tells what it is, and is either whole or not there.
+"""The aerial map on disk: a folder that describes itself, and is either whole or not there.
 
 manifest.json      what the map is, how it was made, and the checksum of every other file
 descriptors.faiss  one descriptor a submap
@@ -42,7 +42,7 @@ GroundMethod = Literal["classes", "filter", "classes and filter"]
 
 @dataclass(frozen=True)
 class BuildCounts:
-    """What became of the survey's points and of the places where a submap could be."""
+    """What became of the survey's points and of the centres on the submaps' grid."""
 
     points_in_files: int = 0
     points_withheld: int = 0
@@ -91,7 +91,7 @@ class Manifest:
     bounds: tuple[float, ...]
     """Min easting, min northing, max easting, max northing of the rasters, metres."""
     vertical_reference: str
-    """What the heights are measured from, as the survey says it; `unknown` where it does not."""
+    """The survey's vertical reference; `unknown` where its files name none."""
     geoid_separation_m: float | None
     """Ellipsoidal height minus the map's height; null where not known."""
     encoder_fingerprint: str

@@ -62,7 +62,7 @@ class Survey:
     def area_m2(self) -> float:
         """The area of the files' boxes, no more than so many points can cover.
 
-        The box of a header with a stray point, or a broken one, says nothing about the area.
+        The box of a header with a stray point, or a broken one, is no measure of the area.
         """
         area_m2 = 0.0
         for header in self.headers:
@@ -72,7 +72,7 @@ class Survey:
 
 
 def read_survey(inputs: Sequence[str | Path], crs: str | None = None) -> Survey:
-    """Read the headers of files, folders and globs; `crs` replaces what the files say.
+    """Read the headers of files, folders and globs; `crs` replaces that of the files.
 
     Files without points are left out. Raises AerialDataError where a file cannot be read or has no CRS, where no file
     holds a point, and where the files differ in CRS or vertical unit.

@@ -30,7 +30,7 @@ BATCH = 32
 _MARGIN_M = 60.0
 """At least this much is looked at around a tile, so that ground and rasters are the same on both sides of an edge."""
 _TERRAIN_REACH_M = 50.0
-"""The terrain is carried this far over places without points, such as canals, and no farther."""
+"""The terrain is continued this far where there are no points, such as canals, and no farther."""
 _FLOWN_REACH_M = 5.0
 """A cell this near to a point counts as flown over."""
 
@@ -150,8 +150,8 @@ def _make_tile(
         data_bounds=_data_bounds(surface, tile_bounds(task.key, task.config.tile_m), task.config.cell_m),
         times=TileTimes(read_s, ground_s, raster_s, cut_s, encode_s),
     )
-    table = np.array(submaps, dtype=SUBMAP_DTYPE)
-    write_result(task.result, TileResult(report, table, np.concatenate(values), terrain, surface, lowest))
+    result = TileResult(report, np.array(submaps, SUBMAP_DTYPE), np.concatenate(values), terrain, surface, lowest)
+    write_result(task.result, result)
     return report
 
 

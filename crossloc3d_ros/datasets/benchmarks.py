@@ -136,7 +136,7 @@ def without_encoder(
     folder: Path,
     advance: Callable[[int], None],
 ) -> None:
-    """Do tasks that need no encoder, in so many processes; `advance` is told of each that is done."""
+    """Do tasks that need no encoder, in so many processes; `advance` counts those done."""
     with open_workers(None, None, workers, None, folder) as pool:
         for _ in pool.run(make, ((task, 1) for task in tasks), advance):
             pass

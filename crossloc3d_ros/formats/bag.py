@@ -98,7 +98,7 @@ class BagTopic:
     """ROS 2 style, `sensor_msgs/msg/PointCloud2`, for ROS 1 bags too."""
     count: int
     offered_qos_profiles: tuple[OfferedQos, ...] = ()
-    """Empty where the recording does not say."""
+    """Empty where the recording names none."""
 
 
 class BagMessage(NamedTuple):
@@ -106,7 +106,7 @@ class BagMessage(NamedTuple):
 
     topic: str
     t_ns: int
-    """When it was recorded; the message's own header may say otherwise."""
+    """When it was recorded; the message's own header may differ."""
     message: Any
 
 

@@ -74,7 +74,7 @@ class CloudTable:
     files: tuple[str, ...]
     """(N,) relative to the dataset's folder."""
     xy_m: Float64Array
-    """(N, 2) easting, northing, metres; NaN where the dataset does not say."""
+    """(N, 2) easting, northing, metres; NaN where the dataset has none."""
     heading_rad: Float64Array
     """(N,) of the cloud's x axis, counter-clockwise from east; 0 for submaps, NaN where not known."""
     is_ground: BoolArray
@@ -145,7 +145,7 @@ def preset_of(folder: Path, name: str | None = None) -> Preset:
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """Return what `dataset.json` says of how the dataset was made; DatasetError where it is missing or damaged."""
+    """Return how the dataset was made, from `dataset.json`; DatasetError where it is missing or damaged."""
     path = folder / INFO
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -36,7 +36,7 @@ GROUND, LOW_NOISE, HIGH_NOISE = 2, 7, 18
 # laspy and lazrs let the errors of their parts through when a file is damaged; lazrs may also panic.
 _READ_ERRORS = (laspy.errors.LaspyException, lazrs.LazrsError, OSError, EOFError, ValueError, struct.error, MemoryError)
 
-# GeoTIFF keys by which LAS 1.0 to 1.3 say their CRS, and the codes of their vertical units.
+# GeoTIFF keys that hold the CRS in LAS 1.0 to 1.3, and the codes of their vertical units.
 _GEOGRAPHIC_KEY, _PROJECTED_KEY, _VERTICAL_KEY, _VERTICAL_UNITS_KEY = 2048, 3072, 4096, 4099
 _UNIT_METRES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
 _ELLIPSOID_CODES = range(5001, 5034)
@@ -44,7 +44,7 @@ _ELLIPSOID_CODES = range(5001, 5034)
 
 @dataclass(frozen=True, eq=False)
 class AerialHeader:
-    """What a file says about itself before any point is read."""
+    """The header of an aerial file."""
 
     path: Path
     point_count: int
@@ -86,7 +86,7 @@ def expand_inputs(inputs: Sequence[str | Path]) -> list[Path]:
 
 
 def read_header(path: Path, crs: str | None = None) -> AerialHeader:
-    """Return what the file says about itself; `crs` replaces the file's own word about its CRS.
+    """Return the header of a file; `crs` replaces the CRS in it.
 
     Raises AerialDataError where the file cannot be read, or has no CRS and none is given.
     """
@@ -141,7 +141,7 @@ def iter_chunks(path: Path, chunk_points: int = 1_000_000, *, threads: bool = Tr
 
 
 class LazWriter:
-    """Writes a LAZ file chunk by chunk (LAS where the name says so), as a context manager.
+    """Writes a LAZ file chunk by chunk (LAS where the name ends in .las), as a context manager.
 
     `scale` is the step of the stored coordinates in the CRS's units, 1e-7 for instance for degrees; heights beside
     degrees are stored to the millimetre. `offset` (3,) is subtracted before storing, by default the corner of the

@@ -1,6 +1,6 @@
 """Learning from a dataset in the layout of CS-Campus3D: a user's own, or a published one.
 
-The clouds of such a dataset were cut once, so a submap is turned in quarters, which loses nothing, and a scan by any
+The clouds of such a dataset were cut once, so a submap is rotated by quarters, which loses nothing, and a scan by any
 angle. Datasets of `make_dataset` bring an area to validate on; of the others a strip of the training clouds is held
 out, and what would see both sides of its border is used for neither.
 """
@@ -297,8 +297,8 @@ def _other_runs(clouds: CloudTable) -> tuple[CloudTable, CloudTable]:
     """Return the clouds of the run that has the most of them, to be looked for among those of the other runs."""
     runs = np.array([file.rsplit("/", 2)[0] for file in clouds.files])
     names, counts = np.unique(runs, return_counts=True)
-    asked = runs == names[counts.argmax()] if len(names) > 1 else np.arange(len(clouds)) % 2 == 0
-    return clouds.rows(asked), clouds.rows(~asked)
+    is_query = runs == names[counts.argmax()] if len(names) > 1 else np.arange(len(clouds)) % 2 == 0
+    return clouds.rows(is_query), clouds.rows(~is_query)
 
 
 def _town(name: str, queries: PlaceSet, submaps: PlaceSet) -> ValidationTown:

@@ -237,7 +237,7 @@ def training_town(
     preprocessing: PreprocessingConfig, rng: np.random.Generator,
 ) -> TrainingTown:  # fmt: skip
     """Scan from poses (S, 4, 4), each in its world, and keep what has something to show beside the survey's points."""
-    # As far as the corners of a turned square, and with every point: the patch is made when the heading is known.
+    # As far as the corners of a rotated square, and with every point: the patch is made when the heading is known.
     reach_m = preprocessing.scan_half_extent_m * _DIAGONAL
     whole = dataclasses.replace(preprocessing, scan_half_extent_m=reach_m, n_points=_MOST_SCAN_POINTS)
     places: list[Float64Array] = []
@@ -300,16 +300,16 @@ def _validation_town(
     low_x, low_y, high_x, high_y = driven.bounds
     centres = submap_centres((low_x + inset, low_y + inset, high_x - inset, high_y - inset), config.spacing_m)
     cut = [(centre, patch.points) for centre in centres if (patch := cutter.cut(centre)) is not None]
-    asked = []
+    queries = []
     for pose in poses:
         scan, scan_config, up = scan_town(driven, pose, config, rng)
         patch = prepare_scan(scan, scan_config, preprocessing, up).patch
         if patch is not None:
-            asked.append((pose[:2, 3], patch.points))
+            queries.append((pose[:2, 3], patch.points))
     return ValidationTown(
         name=Path(task.file).stem,
-        query_xy_m=np.array([place for place, _ in asked]).reshape(-1, 2),
-        query_patches=np.array([points for _, points in asked], np.float32).reshape(-1, n_points, 3),
+        query_xy_m=np.array([place for place, _ in queries]).reshape(-1, 2),
+        query_patches=np.array([points for _, points in queries], np.float32).reshape(-1, n_points, 3),
         submap_xy_m=np.array([centre for centre, _ in cut]).reshape(-1, 2),
         submap_patches=np.array([points for _, points in cut], np.float32).reshape(-1, n_points, 3),
     )

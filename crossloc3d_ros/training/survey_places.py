@@ -17,6 +17,7 @@ from crossloc3d_ros.config import PlacesConfig, PreprocessingConfig, to_dict
 from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.formats.las import expand_inputs
 from crossloc3d_ros.simulation.real_world import LocalSurvey, read_survey, world_from_points
+from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.training.places import SURFACE_CLEARANCE_M, Made, above_terrain, already_made, training_town
 from crossloc3d_ros.training.shards import TRAINING, Manifest, TownEntry, write_manifest, write_town
 from crossloc3d_ros.types import Float64Array, Int64Array
@@ -61,15 +62,7 @@ def make_survey_places(
     )  # fmt: skip
     above_ground = above_terrain(survey.points, survey.classes, survey.bounds, config.cell_m)
     rng = np.random.default_rng(seed)
-    border_m = preprocessing.half_extent_m + 10.0
-    try:
-        poses = world.sample_poses(
-            scans, rng, clearance_m=SURFACE_CLEARANCE_M, border_m=border_m, tilt_deg=config.tilt_deg
-        )
-    except ValueError as error:
-        raise AerialDataError(
-            f"{survey.name}: no ground to drive on {border_m:.0f} m inside of the survey; name neighbouring files too"
-        ) from error
+    poses = _sample_poses(world, survey, scans, config, preprocessing, rng)
     parts = [rows for rows in _parts(poses[:, :2, 3], survey) if len(rows) >= _LEAST_SCANS]
     if not parts:
         raise AerialDataError(f"{survey.name}: {scans} scans are too few for its area; ask for more")
@@ -86,6 +79,21 @@ def make_survey_places(
     manifest = Manifest(settings, tuple(made.values()))
     write_manifest(output, manifest)
     return manifest
+
+
+def _sample_poses(
+    world: World, survey: LocalSurvey, scans: int, config: PlacesConfig, preprocessing: PreprocessingConfig,
+    rng: np.random.Generator,
+) -> Float64Array:  # fmt: skip
+    border_m = preprocessing.half_extent_m + 10.0
+    try:
+        return world.sample_poses(
+            scans, rng, clearance_m=SURFACE_CLEARANCE_M, border_m=border_m, tilt_deg=config.tilt_deg
+        )
+    except ValueError as error:
+        raise AerialDataError(
+            f"{survey.name}: no ground to drive on {border_m:.0f} m inside of the survey; name neighbouring files too"
+        ) from error
 
 
 def _parts(xy_m: Float64Array, survey: LocalSurvey) -> list[Int64Array]:
