@@ -8,13 +8,15 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 # Results depend on some dependencies' versions; a robot's install need not hold them.
 INSTALL := $(PIP) install --quiet --constraint constraints.txt
+NUMERIC_TESTS := $(addprefix test/,aerial_map clouds datasets encoder evaluation localization simulation training)
 
-.PHONY: help setup demo test test-all lint docs docs-serve bench colcon clean
+.PHONY: help setup demo test test-all test-portable lint docs docs-serve bench colcon clean
 
 help:
 	@echo "make demo      build the Amsterdam map, drive a simulated robot through it, localize it, write out/demo/index.html"
 	@echo "make test      lint, types, import contracts and the quick tests"
 	@echo "make test-all  the slow tests too"
+	@echo "make test-portable  the numeric tests as on a processor without AVX-512"
 	@echo "make docs      write the generated references and build the site into out/docs"
 	@echo "make bench     latencies and rates beside this machine's matrix-multiply peak, to out/bench/"
 	@echo "make colcon    build with colcon into install/, to check the ament packaging"
@@ -43,6 +45,15 @@ test: lint
 
 test-all: lint
 	$(BIN)/python -m pytest -m 'slow or not slow'
+
+# What a test states must hold whatever the instruction set: NumPy's, Numba's and torch's sums round differently on each.
+# A test that fails in only one of `test` and `test-portable` needs a margin, not another seed.
+test-portable: export NPY_DISABLE_CPU_FEATURES = X86_V4 AVX512_ICL AVX512_SPR
+test-portable: export NUMBA_CPU_NAME = generic
+test-portable: export NUMBA_CACHE_DIR = $(abspath $(VENV))/numba-generic
+test-portable: export ATEN_CPU_CAPABILITY = default
+test-portable: setup
+	$(BIN)/python -m pytest $(NUMERIC_TESTS)
 
 docs: export NO_MKDOCS_2_WARNING = 1
 docs: setup

@@ -26,9 +26,9 @@ _WGS84_3D = "EPSG:4979"
 _WGS84_ECEF = "EPSG:4978"
 _FARTHEST_M = 4.0e7
 """No projected coordinate on Earth is larger: its girth."""
-_FIT_FROM_POINTS = 2000
-_FIT_TOLERANCE_M = 1e-3
-_BLOCK = 8192
+_FIT_FROM_POINTS = 2000  # with fewer points the fit costs more than it saves
+_FIT_TOLERANCE_M = 1e-3  # below what any survey resolves
+_BLOCK = 8192  # points whose powers stay in the processor's cache
 
 
 @lru_cache(maxsize=256)

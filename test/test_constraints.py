@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import re
+import runpy
+from functools import cache
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from packaging.requirements import Requirement
@@ -25,18 +28,14 @@ INDIRECT = {
 }
 
 
+@cache
 def declared() -> dict[str, Requirement]:
     """Return the requirements that setup.py declares, those of its extras too."""
-    tree = ast.parse((REPOSITORY / "setup.py").read_text())
-    lists = {
-        keyword.arg: ast.literal_eval(keyword.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-        for keyword in node.keywords
-        if keyword.arg in ("install_requires", "extras_require")
-    }
-    texts = [*lists["install_requires"], *(text for extra in lists["extras_require"].values() for text in extra)]
-    return {canonicalize_name(Requirement(text).name): Requirement(text) for text in texts}
+    with mock.patch("setuptools.setup") as setup:
+        runpy.run_path(str(REPOSITORY / "setup.py"))
+    extras = setup.call_args.kwargs["extras_require"].values()
+    requirements = map(Requirement, chain(setup.call_args.kwargs["install_requires"], *extras))
+    return {canonicalize_name(requirement.name): requirement for requirement in requirements}
 
 
 @pytest.mark.parametrize("constraint", CONSTRAINTS, ids=lambda constraint: constraint.name)

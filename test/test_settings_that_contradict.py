@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
+import crossloc3d_ros
 from crossloc3d_ros.config import ScanConfig, from_dict
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError
@@ -36,3 +38,10 @@ def test_a_device_that_is_none_is_refused() -> None:
 def test_a_gpu_that_is_not_there_is_said() -> None:
     with pytest.raises(ConfigError, match="sees no GPU"):
         load_encoder(device="cuda")
+
+
+def test_settings_are_declared_in_the_configuration_and_the_simulator_alone() -> None:
+    """The simulator's stay with it: see the configuration's docstring."""
+    package = Path(crossloc3d_ros.__file__).parent
+    sources = {path.relative_to(package): path.read_text() for path in package.rglob("*.py")}
+    assert {path.parts[0] for path, source in sources.items() if "= option(" in source} == {"config", "simulation"}

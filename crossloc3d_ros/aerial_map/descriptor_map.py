@@ -17,7 +17,7 @@ import numpy as np
 from crossloc3d_ros.errors import MapError
 from crossloc3d_ros.types import Float32Array, Int64Array
 
-_MAPPED_FROM_BYTES = 1 << 30
+_MAPPED_FROM_BYTES = 1 << 30  # a larger map is read from disk as needed instead of filling a robot's memory
 
 
 class DescriptorMap:

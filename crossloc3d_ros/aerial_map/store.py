@@ -29,7 +29,7 @@ from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import Float64Array, Int32Array
 
 FORMAT = "crossloc3d map"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 2  # raised when the files change in a way that older readers cannot read
 
 MANIFEST, DESCRIPTORS, SUBMAPS = "manifest.json", "descriptors.faiss", "submaps.npy"
 TERRAIN, SURFACE, LOWEST = "terrain.tif", "surface.tif", "lowest.tif"

@@ -16,7 +16,7 @@ from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 
 # --- the ground around a robot ------------------------------------------------------------------------------------
 
-_CELL_M = 2.0
+_CELL_M = 2.0  # holds a few points of most rings near the robot, and is narrower than a street
 _STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, never the road
 _STEP_M = 0.25  # and so is a step higher than this
 _BENDING = 0.12  # the ground may fall away from the plane through it by this much a metre of distance
@@ -25,7 +25,7 @@ _DROP_M = 0.4  # what lies this far below the ground around it is another storey
 _CEILING = 0.15  # weight of a cell's ceiling beside that of a flat cell, 1
 _FARTHEST_M = 150.0  # no sensor on a robot sees the ground beyond
 _LEVELS = 3  # the membrane is stretched over cells of 8, 4 and 2 m
-_SWEEPS = 12
+_SWEEPS = 12  # relaxations of each level; coarse levels have done the long range before
 
 
 def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: float = 72.0) -> Float32Array:

@@ -30,7 +30,7 @@ from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 SENSOR_M = 1.2
 """Height of the sensor above the ground, for the highest beam."""
-_BLOCK_CELLS = 1 << 25
+_BLOCK_CELLS = 1 << 25  # results held at once, about 256 MiB in float64
 
 Complex64Array = npt.NDArray[np.complex64]
 

@@ -16,8 +16,8 @@ from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
 Bounds = tuple[float, float, float, float]
 """min easting, min northing, max easting, max northing; metres; the maxima are exclusive."""
 
-_RELAXATIONS = 24
-_MOST_CELLS = 200_000_000
+_RELAXATIONS = 24  # the half resolution has filled the long range before
+_MOST_CELLS = 200_000_000  # more than any tile has: an outlier far off, which would exhaust the memory
 
 
 @dataclass(frozen=True, eq=False)

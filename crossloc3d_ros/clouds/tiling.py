@@ -14,9 +14,9 @@ from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array, Patch
 
-_BIN_M = 5.0
-_MOST_BINS = 4_000_000
-_FARTHEST_M = 4e7
+_BIN_M = 5.0  # a submap reads whole bins: small beside it, and many points each
+_MOST_BINS = 4_000_000  # bounds the memory where stray points stretch the area
+_FARTHEST_M = 4e7  # the circumference of the Earth: beyond it is no coordinate
 
 
 def submap_centres(bounds: tuple[float, float, float, float], spacing_m: float) -> Float64Array:

@@ -22,7 +22,7 @@ from crossloc3d_ros.encoder.model import CrossLoc3D
 from crossloc3d_ros.errors import CheckpointError, CloudError, ConfigError
 from crossloc3d_ros.types import Float32Array
 
-MAX_HEADINGS = 64
+MAX_HEADINGS = 64  # the largest that training allows (`TrainConfig.headings`, `rotations`)
 
 
 class Encoder:

@@ -25,10 +25,10 @@ from crossloc3d_ros.formats.plain_pickle import read_plain_pickle
 from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array, UInt8Array
 
 INFO = "dataset.json"
-INFO_FORMAT = 1
-CLOUD_POINTS = 4096
-_MOST_CLOUDS = 5_000_000
-_NAMED = 3
+INFO_FORMAT = 1  # of the information file beside a dataset of one's own; a reader refuses others
+CLOUD_POINTS = 4096  # as the published files hold
+_MOST_CLOUDS = 5_000_000  # far more than any dataset has: a damaged or hostile file
+_NAMED = 3  # missing files that a message names before it counts
 _POSITIONS_CSV = "pointcloud_locations_20m_10overlap.csv"
 
 

@@ -24,8 +24,8 @@ from numba import njit
 from crossloc3d_ros.errors import DatasetError
 from crossloc3d_ros.types import Int32Array, UInt8Array
 
-MOST_BYTES = 8 << 30
-_RUN = 4096
+MOST_BYTES = 8 << 30  # far more than any dataset's file: what is larger is refused before it is read
+_RUN = 4096  # numbers decoded at once
 
 _NUMBER = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|U\d{1,4}|S\d{1,4})")
 

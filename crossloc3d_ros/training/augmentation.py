@@ -13,10 +13,10 @@ from crossloc3d_ros.types import Float32Array
 
 _HEADING_MARGIN = 1.25
 """How far beyond half the step between two headings the weights learn to follow."""
-_THING_RADIUS_M = (1.0, 6.0)
-_THING_HEIGHT_M = (1.5, 12.0)
-_THING_POINTS = (20, 300)
-_PAPER_DROP = 0.1
+_THING_RADIUS_M = (1.0, 6.0)  # cars, huts and trees that come or go (`TrainConfig.changes`)
+_THING_HEIGHT_M = (1.5, 12.0)  # of the same
+_THING_POINTS = (20, 300)  # of the same, in a survey
+_PAPER_DROP = 0.1  # this and the following: the published recipe, see `paper_cloud` and `paper_batch`
 _PAPER_SHIFT = 0.01
 _PAPER_CUBOID_SHARE = 0.4
 _PAPER_CUBOID_AREA = (0.02, 0.33)

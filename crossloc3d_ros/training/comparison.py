@@ -51,7 +51,7 @@ TableName = Literal[
 TABLES: tuple[TableName, ...] = get_args(TableName)
 RANKS, RADII_M = (1, 5, 25), (100.0, 25.0)
 RESULT, PREDICTIONS, ENDED = "result.json", "predictions.npz", "ended.txt"
-_FORMAT = 1
+_FORMAT = 1  # of stored results; others are computed anew
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.types import Float64Array
 
 _RECALLS = (("R@1", 100.0), ("R@1", 50.0), ("R@1", 25.0), ("R@25", 100.0))
-_MOST_POINTS = 300
-_RELOAD_S = 60
+_MOST_POINTS = 300  # of a curve: more than its width in pixels shows
+_RELOAD_S = 60  # of a page while training runs
 
 
 def write_curve(folder: Path, path: Path | None = None, *, live: bool = False) -> Path:

@@ -39,10 +39,10 @@ from crossloc3d_ros.types import Float32Array
 
 logger = logging.getLogger(__name__)
 
-_ENCODE_BATCH = 32
-_NORM_BATCHES = 8
+_ENCODE_BATCH = 32  # clouds without a graph at once; bounds the memory
+_NORM_BATCHES = 8  # enough for means and variances of every channel
 _NORM_STEP = 2**40  # batches for the norm statistics come from beyond any run's own
-_MOST_BAD_STEPS = 20
+_MOST_BAD_STEPS = 20  # so many losses in a row that are not finite do not recover
 
 
 @dataclass(frozen=True)

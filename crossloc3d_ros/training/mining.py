@@ -13,8 +13,8 @@ from crossloc3d_ros.training.sampling import HardPlaces, Sampler
 from crossloc3d_ros.training.validation import RADII_M, euclidean_distances
 from crossloc3d_ros.types import Float32Array
 
-_NEIGHBOURS = 8
-_ROWS = 1024
+_NEIGHBOURS = 8  # a place's most similar ones; a batch holds a few of them
+_ROWS = 1024  # rows of the distance matrix held at once
 
 
 def mine(

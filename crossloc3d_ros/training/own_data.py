@@ -26,7 +26,7 @@ from crossloc3d_ros.training.sampling import Batch, HardPlaces
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
-_ATTEMPTS = 60
+_ATTEMPTS = 60  # scans drawn in vain before the material is declared unusable
 _HELD_OUT = 0.1
 """Share of the scans that is held out where the dataset has no validation area."""
 _CLOUD_REACH_M = 25.0

@@ -42,12 +42,12 @@ from crossloc3d_ros.training.shards import (
 )
 from crossloc3d_ros.types import Float32Array, Float64Array, Scan, UInt8Array
 
-_UNCLASSIFIED = 1
-_SEEDS_A_SET = 100_000
-_VALIDATION_SEEDS = 50_000
-_DIAGONAL = 2.0**0.5 + 0.01
-_MOST_SCAN_POINTS = 30_000
-_SURFACE_STREAM = 11
+_UNCLASSIFIED = 1  # ASPRS class
+_SEEDS_A_SET = 100_000  # towns of one set's seed never meet those of another
+_VALIDATION_SEEDS = 50_000  # from here on a set's seeds are for validation
+_DIAGONAL = 2.0**0.5 + 0.01  # of a square over its side, and a hair for rounding
+_MOST_SCAN_POINTS = 30_000  # more than a turn of the sensor has: every point is kept
+_SURFACE_STREAM = 11  # the random numbers of surfaces, apart from those of scans
 SURFACE_CLEARANCE_M = 1.5
 """As a route through a real survey keeps by default."""
 

@@ -17,8 +17,8 @@ from crossloc3d_ros.training.augmentation import change, heading_error, occlude,
 from crossloc3d_ros.training.shards import TrainingTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
-_CELL_M = 10.0
-_ATTEMPTS = 60
+_CELL_M = 10.0  # a cut reads whole cells: small beside a patch, and many points each
+_ATTEMPTS = 60  # scans drawn in vain before the material is declared unusable
 _HARD_GROUP = 4
 """Places of a batch that were taken for each other."""
 

@@ -17,7 +17,7 @@ from crossloc3d_ros.files import atomic_path, write_atomically
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 MANIFEST = "manifest.json"
-FORMAT = 2
+FORMAT = 2  # of stored material; a reader refuses others
 TRAINING = "train"
 VALIDATION = "validation"
 

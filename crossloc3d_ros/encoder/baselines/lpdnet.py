@@ -20,9 +20,9 @@ from crossloc3d_ros.config import ModelConfig
 from crossloc3d_ros.encoder.base import Network
 from crossloc3d_ros.encoder.baselines.pointnet import Layer, PointVlad, TransformNet
 
-NEIGHBOURS = 20
-FEATURES = 10
-_NIL = 1e-12
+NEIGHBOURS = 20  # the release chooses a number for each point; see above
+FEATURES = 10  # as published
+_NIL = 1e-12  # keeps logarithms and quotients of flat neighbourhoods finite
 
 
 class Neighbourhood(nn.Module):

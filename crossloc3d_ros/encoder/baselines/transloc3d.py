@@ -26,7 +26,7 @@ from crossloc3d_ros.encoder.sparse import voxelize
 
 MEMORIES = (4.0, 2.0, 2.0, 1.0, 1.0, 1.0)
 """Centres of each attention layer, over `channels`."""
-HEADS = 2
+HEADS = 2  # as published
 
 
 class TransLoc3D(Network):
