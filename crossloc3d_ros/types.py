@@ -97,7 +97,7 @@ class AlignedPoses:
     """(n,) whether the refinement came to rest inside of the area searched."""
     source: Int64Array
     """(n,) which candidate the search began at: its row among the candidates; -1 - h for hypothesis h, and
-    `EXHAUSTIVE` where the whole map was searched."""
+    `WHOLE_MAP` where the whole map was searched."""
     log_prior: float = 0.0
     """Natural logarithm of the odds, before the scan, that the robot is at a given one of the places of the map rather
     than off it: `probabilities` is the softmax of `log_likelihood + log_prior` beside a 0 for none of them."""
@@ -106,7 +106,7 @@ class AlignedPoses:
         return len(self.log_likelihood)
 
 
-EXHAUSTIVE = -(2**31)
+WHOLE_MAP = -(2**31)
 """`AlignedPoses.source` of a pose found by a search of the whole map."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from crossloc3d_ros.clouds.filters import levelling_matrix
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.fusion import tracking
+from crossloc3d_ros.localization.fusion.decision import Belief
 from crossloc3d_ros.localization.retrieval import place_belief as credibility
 from crossloc3d_ros.types import (
     AlignedPoses,
@@ -91,7 +91,7 @@ def posed_estimate(
     place: credibility.Belief,
     candidates: Candidates,
     aligned: AlignedPoses,
-    belief: tracking.Belief,
+    belief: Belief,
     gravity_base: Float64Array | None,
     counts: ScanCounts,
     watch: Watch,

@@ -14,7 +14,8 @@ from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
 from crossloc3d_ros.localization.fusion.odometry import Motion
-from crossloc3d_ros.localization.fusion.tracking import PosePrior, Tracker
+from crossloc3d_ros.localization.fusion.priors import PosePrior
+from crossloc3d_ros.localization.fusion.tracker import Tracker
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
 from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration, judge
 from crossloc3d_ros.types import (

@@ -18,7 +18,7 @@ from crossloc3d_ros.localization.estimates import (
     placed_estimate,
     posed_estimate,
 )
-from crossloc3d_ros.localization.fusion import tracking
+from crossloc3d_ros.localization.fusion.decision import Belief
 from crossloc3d_ros.localization.retrieval import place_belief as credibility
 from crossloc3d_ros.types import (
     Estimate,
@@ -41,15 +41,15 @@ PLACE = credibility.Belief(
 )  # fmt: skip
 
 
-def belief(grid: list[float], heading: float = 0.6, is_fix: bool = True) -> tracking.Belief:
+def belief(grid: list[float], heading: float = 0.6, is_fix: bool = True) -> Belief:
     A = np.random.default_rng(0).normal(size=(3, 3))
-    return tracking.Belief(
+    return Belief(
         state=TrackState.LOCALIZED, reason="", probability=0.9995, grid=np.array(grid), heading_rad=heading,
         covariance=A @ A.T, hypotheses=no_hypotheses(), is_fix=is_fix,
     )  # fmt: skip
 
 
-def posed(about: tracking.Belief, gravity: Float64Array | None = None) -> Estimate:
+def posed(about: Belief, gravity: Float64Array | None = None) -> Estimate:
     return posed_estimate(
         7, FRAME, PLACE, no_candidates(), no_aligned_poses(), about, gravity, ScanCounts(received=3), Watch()
     )

@@ -24,7 +24,7 @@ from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     BoolArray,
     Estimate,
@@ -190,7 +190,7 @@ class EstimateTable:
         The likeliest aligned pose whose search did not begin at a hypothesis, which earlier scans have led to.
         """
         grid, heading = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
-        alone = (self.aligned_sources >= 0) | (self.aligned_sources == EXHAUSTIVE)
+        alone = (self.aligned_sources >= 0) | (self.aligned_sources == WHOLE_MAP)
         for scan in np.flatnonzero(alone.any(axis=1)):
             first = int(alone[scan].argmax())
             grid[scan], heading[scan] = self.aligned.grid[scan, first], self.aligned.heading_rad[scan, first]

@@ -32,7 +32,7 @@ from crossloc3d_ros.localization.alignment.pose_search import (
     wrapped,
 )
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     BoolArray,
     Candidates,
@@ -226,7 +226,7 @@ class Alignment:
         )
         scores = scores_at(self._fine, self._likelihood, peaks.poses, self._threads)
         if source is None:
-            source = np.full(len(poses), EXHAUSTIVE, np.int64)
+            source = np.full(len(poses), WHOLE_MAP, np.int64)
             if len(self._places):
                 away = self._away(peaks.poses)
                 near = away.min(axis=1) <= 2.0 * self._config.candidate_radius_m

@@ -17,7 +17,7 @@ from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, fine_counts
 from crossloc3d_ros.localization.alignment.pose_search import wrapped
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     Candidates,
     Hypotheses,
@@ -114,7 +114,7 @@ def test_the_whole_map_is_searched_with_the_same_result(aligner: Aligner, scan: 
     near = aligner.align(scan, BASE, around(place[:2]))
     everywhere = aligner.align(scan, BASE, no_candidates(), everywhere=True)
     check(everywhere)
-    assert (everywhere.source == EXHAUSTIVE).all()
+    assert (everywhere.source == WHOLE_MAP).all()
     np.testing.assert_allclose(everywhere.grid[0], near.grid[0], atol=0.3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(aligner, "threads", 1 if aligner.threads > 1 else 2)
