@@ -23,12 +23,12 @@ from scipy import ndimage
 
 from crossloc3d_ros.aerial_map.geotiff import write_geotiff
 from crossloc3d_ros.aerial_map.store import TERRAIN, AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
 from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.errors import CloudError, MapError
-from crossloc3d_ros.localization.alignment.pose_search import wrapped
 from crossloc3d_ros.localization.fusion.decision import RIGHT_WITHIN_M
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
@@ -319,7 +319,7 @@ def test_a_compass_that_counts_clockwise_from_north(ride: Ride) -> None:
 
     for T in ride.ways[:8, -1]:
         heading = math.atan2(T[1, 0], T[0, 0])
-        assert abs(wrapped(clockwise(heading) - heading)) > math.radians(60.0)
+        assert abs(wrap(clockwise(heading) - heading)) > math.radians(60.0)
     alone, robot = Robot(ride), Robot(ride)
     [without], [misled] = alone.drive(alone.ahead(1)), robot.drive(robot.ahead(1), compass=clockwise)
     assert 1.0 - misled.estimate.probability > 2.0 * (1.0 - without.estimate.probability)
