@@ -58,7 +58,7 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
 
     weights = Path(config.weights) if config.weights else None
     encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
-    return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
+    return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config, threads=config.threads)
 
 
 @dataclass(frozen=True, eq=False)
