@@ -17,7 +17,7 @@ from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.fusion.tracker import Tracker
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
-from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration, judge
+from crossloc3d_ros.localization.retrieval.place_belief import decide, effective_calibration
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,
@@ -84,7 +84,7 @@ class Localizer:
         watch.lap("encode_ms")
         found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
         candidates = _first(found, self.config.top_k)
-        place = judge(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
+        place = decide(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)

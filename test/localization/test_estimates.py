@@ -19,7 +19,7 @@ from crossloc3d_ros.localization.estimates import (
     posed_estimate,
 )
 from crossloc3d_ros.localization.fusion.decision import Belief
-from crossloc3d_ros.localization.retrieval import place_belief as credibility
+from crossloc3d_ros.localization.retrieval.place_belief import PlaceBelief
 from crossloc3d_ros.types import (
     Estimate,
     FixStatus,
@@ -35,7 +35,7 @@ ORIGIN = np.array(
     [500_000.0 + 130_000.0, 5_803_000.0, 31.0]
 )  # 1.9 degrees off the zone's middle: grid and true north differ
 FRAME = MapFrame("EPSG:32631", ORIGIN, 43.0)
-PLACE = credibility.Belief(
+PLACE = PlaceBelief(
     status=FixStatus.FIX, reason="a place", probability=0.5, enu=np.array([300.0, -200.0, 4.0]),
     covariance=np.diag([400.0, 400.0, 9.0]), members=np.ones(1, np.bool_),
 )  # fmt: skip

@@ -159,7 +159,7 @@ def test_a_scan_from_nowhere_gives_no_fix(localizer: Localizer) -> None:
     box[:4500, 0] = 3.0
     estimate = localizer.localize(Scan(box.astype(np.float32), STAMP_NS, "velodyne"))
     assert estimate.status is FixStatus.NO_FIX
-    assert "nothing in the map looks like the scan" in estimate.reason
+    assert "no submap resembles the scan" in estimate.reason
     assert len(estimate.candidates) == 25
 
 

@@ -16,7 +16,7 @@ from numba import njit
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 LAYERS_M = np.array([0.5, 1.5, 3.0, 6.0, 50.0], np.float32)
-"""(L + 1,) heights above the ground between which the L layers lie."""
+"""(L + 1,) heights above the ground between which the L layers lie: thinner near the ground, where robots see most."""
 LAYERS = len(LAYERS_M) - 1
 CHANNELS = 2 * LAYERS
 """Hits of each layer, then free space of each."""

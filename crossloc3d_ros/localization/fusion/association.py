@@ -51,7 +51,7 @@ def measurements(aligned: AlignedPoses, config: FusionConfig) -> AlignedPoses:
             kept.append(i)
     rows, covariance = rows[kept], covariance[kept]
     log_likelihood = config.likelihood_weight * aligned.log_likelihood[rows]
-    # However well a scan fits somewhere: a place off the map may look so, too.
+    # However well a scan fits somewhere: a place off the map may resemble it.
     log_likelihood -= max(float(log_likelihood.max(initial=0.0)) - config.max_log_likelihood, 0.0)
     return AlignedPoses(
         grid=aligned.grid[rows],
@@ -119,7 +119,7 @@ def _late_detection(mixture: Mixture, log_likelihood: Float64Array, config: Fusi
 
     Such a pose lacks the evidence of the spots before, and would have fitted there as it does here. So it is granted
     what the likeliest hypothesis has accumulated, in proportion to how well it fits, times the probability of having
-    been missed all the way. None where nothing was accumulated.
+    been missed by all scans before. None where nothing was accumulated.
     """
     if not len(mixture):
         return None

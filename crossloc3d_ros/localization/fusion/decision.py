@@ -30,11 +30,11 @@ class Belief:
     probability: float
     """That the horizontal error of `grid` is below 10 m."""
     grid: Float64Array
-    """(3,) easting, northing, height of base, metres, grid frame; NaN where nothing is believed."""
+    """(3,) easting, northing, height of base, metres, grid frame; NaN without hypotheses."""
     heading_rad: float
-    """Counter-clockwise from grid east; NaN where nothing is believed."""
+    """Counter-clockwise from grid east; NaN without hypotheses."""
     covariance: Float64Array
-    """(3, 3) of easting, northing, heading: m2, m rad, rad2; NaN where nothing is believed."""
+    """(3, 3) of easting, northing, heading: m2, m rad, rad2; NaN without hypotheses."""
     hypotheses: Hypotheses
     is_fix: bool
     """Whether the estimate may be driven by."""

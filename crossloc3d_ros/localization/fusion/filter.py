@@ -30,7 +30,7 @@ UNKNOWN_HEADING_VARIANCE = math.pi**2 / 3.0
 """Of a heading that is uniform over the circle, rad2."""
 _GATE = 16.27  # chi-square of three degrees of freedom, 99.9 %
 _ODOMETRY_CORRELATION_M = 200.0  # distance over which systematic errors of odometry change: floors and loads do
-_NIS_GAIN = 0.1  # of the running mean: some ten scans tell noise from inconsistency
+_NIS_GAIN = 0.1  # of the running mean: over some ten scans, inconsistency stands out from noise
 _NIS_MOST = 10.0  # one outlier moves the mean by no more than this
 _NIS_TOLERATED = 1.3  # above, the process noise grows: less happens by chance in ten scans
 _NOISE_SCALE_RATE = 0.2  # logarithm by which it grows a scan, for each unit above
@@ -61,15 +61,15 @@ def predict(mixture: Mixture, motion: Motion, config: FusionConfig) -> Mixture:
     variance = covariance[:, HEADING, HEADING]
     shrink = np.exp(-0.5 * variance)
     rotation = _rotations(mean[:, HEADING])
-    way = _displacements(mean, motion)
-    across = np.column_stack([-way[:, 1], way[:, 0]])
+    shift = _displacements(mean, motion)
+    across = np.column_stack([-shift[:, 1], shift[:, 0]])
     step = np.tile(np.eye(STATE_SIZE), (len(mixture), 1, 1))
     step[:, POSITION, HEADING] = shrink[:, None] * across
-    step[:, POSITION, ODOMETRY_SCALE] = (shrink / (1.0 + mean[:, ODOMETRY_SCALE]))[:, None] * way
+    step[:, POSITION, ODOMETRY_SCALE] = (shrink / (1.0 + mean[:, ODOMETRY_SCALE]))[:, None] * shift
     step[:, HEADING, ODOMETRY_DRIFT] = motion.distance_m
-    mean[:, POSITION] += shrink[:, None] * way
+    mean[:, POSITION] += shrink[:, None] * shift
     mean[:, HEADING] = wrap(mean[:, HEADING] + motion.delta[2] + motion.distance_m * mean[:, ODOMETRY_DRIFT])
-    # Errors that last change along the way, and keep their size.
+    # Errors that last change with the distance, and keep their size.
     correlation_m = np.array([config.measurement_correlation_m] * 3 + [_ODOMETRY_CORRELATION_M] * 2)
     kept = np.exp(-motion.distance_m / correlation_m)
     mean[:, LASTING_ERRORS] *= kept
@@ -79,7 +79,7 @@ def predict(mixture: Mixture, motion: Motion, config: FusionConfig) -> Mixture:
     # What the linear step leaves out where the heading is hardly known.
     along2 = 0.5 * (1.0 - np.exp(-variance)) ** 2
     across2 = 0.5 * (1.0 - np.exp(-2.0 * variance)) - variance * np.exp(-variance)
-    moved[:, POSITION, POSITION] += along2[:, None, None] * way[:, :, None] * way[:, None, :]
+    moved[:, POSITION, POSITION] += along2[:, None, None] * shift[:, :, None] * shift[:, None, :]
     moved[:, POSITION, POSITION] += across2[:, None, None] * across[:, :, None] * across[:, None, :]
     noise = rotation @ motion.covariance @ rotation.transpose(0, 2, 1)
     moved[:, POSE, POSE] += mixture.process_noise_scale[:, None, None] * noise

@@ -1,4 +1,4 @@
-"""The Gaussian mixture over the poses that the robot may have, each with the errors that last along the way."""
+"""The Gaussian mixture over the poses that the robot may have, each with the errors that last from scan to scan."""
 
 from __future__ import annotations
 
