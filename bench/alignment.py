@@ -13,10 +13,10 @@ from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.localization.alignment.aligner import (
+    COARSE_FREE,
     COARSE_HEADINGS,
-    COARSE_PASSAGES,
-    COARSE_RETURNS,
-    PEAKS_EVERYWHERE,
+    COARSE_HITS,
+    MAP_COARSE_FACTOR,
     Aligner,
 )
 from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
@@ -46,18 +46,18 @@ def bench_alignment(aerial_map: AerialMap, scans: list[PreparedScan], runs: int)
 
         return action
 
-    def followed() -> None:
+    def tracked() -> None:
         at = grid[rng.integers(0, len(grid), 1)]
         one = Hypotheses(at, np.zeros(1), np.eye(3)[None], np.ones(1))
-        aligner.align(scans[next(turn) % len(scans)], (0.0, 0.0), no_candidates(), one, around=False)
+        aligner.align(scans[next(turn) % len(scans)], (0.0, 0.0), no_candidates(), one, search_candidates=False)
 
     def everywhere() -> None:
-        aligner.align(scans[next(turn) % len(scans)], (0.0, 0.0), no_candidates(), everywhere=True)
+        aligner.align(scans[next(turn) % len(scans)], (0.0, 0.0), no_candidates(), search_map=True)
 
     for count, target in ((25, "150, goal 60"), (100, "")):
-        name = f"alignment: {count} candidates, {aligner.threads} threads"
-        figures.append(Figure(name, median_ms(of(count), runs), "ms", target, note="places drawn by lot"))
-    figures.append(Figure("alignment: one hypothesis", median_ms(followed, runs), "ms"))
+        name = f"alignment: {count} candidates, {aligner.pool.threads} threads"
+        figures.append(Figure(name, median_ms(of(count), runs), "ms", target, note="random places"))
+    figures.append(Figure("alignment: one hypothesis", median_ms(tracked, runs), "ms"))
     figures.append(Figure("alignment: the whole map", median_ms(everywhere, max(runs // 4, 3)), "ms"))
     figures.append(_large(aligner, evidence_of(scans[0].place, scans[0].sensor_height_m)))
     return figures
@@ -65,9 +65,9 @@ def bench_alignment(aerial_map: AerialMap, scans: list[PreparedScan], runs: int)
 
 def _large(aligner: Aligner, evidence: Evidence) -> Figure:
     """Time the search of every pose on coarse cells, and scale it to a larger map: it grows with the area."""
-    level, threads = aligner.likelihood.levels[0], aligner.threads
-    most = PEAKS_EVERYWHERE * aligner.config.peaks
-    laid = evidence.coarser(level.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
+    level = aligner.likelihood.levels[0]
+    most = MAP_COARSE_FACTOR * aligner.config.coarse_maxima
+    coarse = evidence.coarser(level.cell_m, COARSE_HITS, COARSE_FREE)
     margin = int(120.0 / level.cell_m)
     rows, columns = level.ratios.shape[1:]
     along = np.arange(margin, rows - margin)
@@ -75,11 +75,11 @@ def _large(aligner: Aligner, evidence: Evidence) -> Figure:
     times = []
     for _ in range(4):
         began = time.perf_counter()
-        search_cells(laid, level, runs, COARSE_HEADINGS, most, 8.0, threads)
+        search_cells(coarse, level, runs, COARSE_HEADINGS, most, 8.0, aligner.pool)
         times.append(time.perf_counter() - began)
     area = runs[:, 2].sum() * level.cell_m**2 / 1e6
     seconds = float(np.median(times[1:])) * LARGE_KM2 / area
     return Figure(
-        f"alignment: every pose of {LARGE_KM2:g} km2, coarse, {threads} threads", seconds, "s", "3",
+        f"alignment: every pose of {LARGE_KM2:g} km2, coarse, {aligner.pool.threads} threads", seconds, "s", "3",
         note=f"from {area:.2f} km2",
     )  # fmt: skip

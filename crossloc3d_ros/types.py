@@ -90,29 +90,29 @@ class AlignedPoses:
     log_likelihood: Float64Array
     """(n,) natural logarithm of how much likelier the scan is here than at a place that the map does not hold."""
     probabilities: Float64Array
-    """(n,) share of belief from this scan alone; what is missing to 1 is the belief in none of them."""
+    """(n,) from this scan alone; what is missing to 1 is that of the null hypothesis, that none of them is right."""
     inliers: Float64Array
-    """(n,) share of the scan's returns that the map explains at this pose."""
+    """(n,) share of the scan's evidence that the map explains at this pose."""
     converged: BoolArray
-    """(n,) whether the refinement came to rest inside of the area searched."""
+    """(n,) whether the refinement converged inside of the area searched."""
     source: Int64Array
-    """(n,) which candidate the search began at: its row among the candidates; -1 - h for hypothesis h, and
-    `EXHAUSTIVE` where the whole map was searched."""
+    """(n,) which candidate it was found at: its row among the candidates; -1 - h for hypothesis h, and
+    `WHOLE_MAP` where the whole map was searched."""
     log_prior: float = 0.0
     """Natural logarithm of the odds, before the scan, that the robot is at a given one of the places of the map rather
-    than off it: `probabilities` is the softmax of `log_likelihood + log_prior` beside a 0 for none of them."""
+    than off it: `probabilities` is the softmax of `log_likelihood + log_prior` and a 0 for the null hypothesis."""
 
     def __len__(self) -> int:
         return len(self.log_likelihood)
 
 
-EXHAUSTIVE = -(2**31)
+WHOLE_MAP = -(2**31)
 """`AlignedPoses.source` of a pose found by a search of the whole map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Poses that the robot may have, carried along by odometry, likeliest first."""
+    """Poses that the robot may have, tracked by odometry, likeliest first."""
 
     grid: Float64Array
     """(h, 3) easting, northing, height of base, metres, grid frame."""
@@ -121,7 +121,7 @@ class Hypotheses:
     covariance: Float64Array
     """(h, 3, 3) of easting, northing, heading: m2, m rad, rad2."""
     probabilities: Float64Array
-    """(h,) what is missing to 1 is the belief in none of them."""
+    """(h,) what is missing to 1 is that of the null hypothesis."""
 
     def __len__(self) -> int:
         return len(self.probabilities)
@@ -131,13 +131,13 @@ class TrackState(Enum):
     """How far the robot knows where it is."""
 
     SEARCHING = "searching"
-    """Nothing is believed yet."""
+    """The null hypothesis is likelier than all poses."""
     AMBIGUOUS = "ambiguous"
-    """Several places are believed."""
+    """Some poses are likely, none by more than the threshold."""
     LOCALIZED = "localized"
-    """One place is believed, by more than the threshold."""
+    """One pose is probable, by more than the threshold."""
     LOST = "lost"
-    """It was localized, and what it sees no longer fits."""
+    """It was localized, and the scans no longer fit."""
 
 
 class FixStatus(Enum):

@@ -207,7 +207,7 @@ class LocalizerNodeConfig(LocalizerConfig):
     map: str = option("", "folder of the aerial map, as build_map writes it")
     weights: str = option("", "weights file (safetensors); empty = the shipped weights")
     device: Literal["cpu", "cuda"] = option("cpu", "where the encoder runs")
-    threads: int = option(0, "CPU threads of the encoder; 0 = one per core, at most four", low=0, high=64)
+    threads: int = option(0, "CPU threads of encoder and alignment; 0 = one per core, at most four", low=0, high=64)
     queue_depth: int = option(
         4,
         "scans that may wait; when more arrive, all but the newest are dropped",

@@ -1,4 +1,4 @@
-"""From what was found to what is told: estimates in every frame that a robot may ask for."""
+"""From beliefs to estimates, in the frames that robots use: grid, ENU map frame, geographic."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from crossloc3d_ros.clouds.filters import levelling_matrix
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.fusion import tracking
-from crossloc3d_ros.localization.retrieval import place_belief as credibility
+from crossloc3d_ros.localization.fusion.decision import Belief
+from crossloc3d_ros.localization.retrieval.place_belief import PlaceBelief
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,
@@ -25,11 +25,11 @@ from crossloc3d_ros.types import (
 )
 
 HEIGHT_STD_M, TILT_STD_RAD = 0.5, math.radians(2.0)
-"""Of the terrain under the base, and of its roll and pitch."""
+"""Of the terrain under the base, and of its roll and pitch: of a wheeled robot on roads and paths."""
 
 
 class Watch:
-    """Milliseconds from lap to lap."""
+    """A stopwatch of the steps, milliseconds."""
 
     def __init__(self) -> None:
         self.timings = Timings()
@@ -63,9 +63,9 @@ def no_estimate(
 
 
 def placed_estimate(
-    stamp_ns: int, frame: MapFrame, place: credibility.Belief, candidates: Candidates, counts: ScanCounts, watch: Watch
+    stamp_ns: int, frame: MapFrame, place: PlaceBelief, candidates: Candidates, counts: ScanCounts, watch: Watch
 ) -> Estimate:
-    """Return the estimate that retrieval alone gives: a place of some tens of metres, no heading."""
+    """Return the estimate by retrieval alone: a place of some tens of metres, no heading."""
     grid = frame.from_enu(place.enu[None])
     latitude, longitude, altitude = frame.to_geographic(grid)
     return Estimate(
@@ -88,52 +88,42 @@ def placed_estimate(
 def posed_estimate(
     stamp_ns: int,
     frame: MapFrame,
-    place: credibility.Belief,
+    place: PlaceBelief,
     candidates: Candidates,
     aligned: AlignedPoses,
-    belief: tracking.Belief,
+    belief: Belief,
     gravity_base: Float64Array | None,
     counts: ScanCounts,
     watch: Watch,
 ) -> Estimate:
-    """Return the estimate of a tracked pose; where no pose is believed at all, the place, without a fix."""
-    if not np.isfinite(belief.grid[:2]).all():
-        placed = placed_estimate(stamp_ns, frame, place, candidates, counts, watch)
-        return dataclasses.replace(
-            placed, status=FixStatus.NO_FIX, reason=belief.reason, state=belief.state, probability=belief.probability,
-            aligned=aligned, hypotheses=belief.hypotheses,
-        )  # fmt: skip
-    height = belief.grid[2] if math.isfinite(belief.grid[2]) else float(frame.from_enu(place.enu[None])[0, 2])
+    """Return the estimate of a tracked pose; without any hypothesis the retrieved place, without a fix."""
+    is_posed = bool(np.isfinite(belief.grid[:2]).all())
+    placed = dataclasses.replace(
+        placed_estimate(stamp_ns, frame, place, candidates, counts, watch),
+        status=FixStatus.FIX if is_posed and belief.is_fix else FixStatus.NO_FIX,
+        reason=belief.reason,
+        state=belief.state,
+        probability=belief.probability,
+        aligned=aligned,
+        hypotheses=belief.hypotheses,
+    )
+    if not is_posed:
+        return placed
+    height = belief.grid[2] if math.isfinite(belief.grid[2]) else placed.grid[2]
     grid = np.array([belief.grid[0], belief.grid[1], height])
-    enu = frame.to_enu(grid[None])[0]
     latitude, longitude, altitude = frame.to_geographic(grid[None])
     turn = -float(frame.convergence_rad(grid[None])[0])
     T_map_base = np.eye(4)
     T_map_base[:3, :3] = _about_z(belief.heading_rad + turn)
     if gravity_base is not None:
         T_map_base[:3, :3] = T_map_base[:3, :3] @ levelling_matrix(gravity_base)[:3, :3]
-    T_map_base[:3, 3] = enu
+    T_map_base[:3, 3] = frame.to_enu(grid[None])[0]
     pose_covariance = _in_map(belief.covariance, turn)
-    return Estimate(
-        stamp_ns=stamp_ns,
-        status=FixStatus.FIX if belief.is_fix else FixStatus.NO_FIX,
-        reason=belief.reason,
-        grid=grid,
-        enu=enu,
-        latitude_deg=float(latitude[0]),
-        longitude_deg=float(longitude[0]),
-        altitude_m=float(altitude[0]),
-        covariance=pose_covariance[:3, :3],
-        candidates=candidates,
-        counts=counts,
-        timings=watch.timings,
-        state=belief.state,
-        probability=belief.probability,
-        T_map_base=T_map_base,
-        pose_covariance=pose_covariance,
-        aligned=aligned,
-        hypotheses=belief.hypotheses,
-    )
+    return dataclasses.replace(
+        placed, grid=grid, enu=T_map_base[:3, 3].copy(), latitude_deg=float(latitude[0]),
+        longitude_deg=float(longitude[0]), altitude_m=float(altitude[0]), covariance=pose_covariance[:3, :3],
+        T_map_base=T_map_base, pose_covariance=pose_covariance,
+    )  # fmt: skip
 
 
 def _about_z(angle: float) -> Float64Array:

@@ -14,9 +14,10 @@ from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
 from crossloc3d_ros.localization.fusion.odometry import Motion
-from crossloc3d_ros.localization.fusion.tracking import PosePrior, Tracker
+from crossloc3d_ros.localization.fusion.priors import PosePrior
+from crossloc3d_ros.localization.fusion.tracker import Tracker
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
-from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration, judge
+from crossloc3d_ros.localization.retrieval.place_belief import decide, effective_calibration
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,
@@ -35,13 +36,21 @@ __all__ = ["Localizer", "no_estimate"]
 class Localizer:
     """Tell where on an aerial map a LiDAR is, scan after scan, without an initial pose."""
 
-    def __init__(self, aerial_map: AerialMap, encoder: DescriptorEncoder, config: LocalizerConfig) -> None:
-        """Bring map and encoder together; they must belong to each other, as `AerialMap.load` ensures."""
+    def __init__(
+        self, aerial_map: AerialMap, encoder: DescriptorEncoder, config: LocalizerConfig, *, threads: int = 0
+    ) -> None:
+        """Bring map and encoder together; they must belong to each other, as `AerialMap.load` ensures.
+
+        `threads` align a scan; 0 = `usable_threads()`.
+        """
         self.aerial_map = aerial_map
         self.encoder = encoder
         self.config = config
         self.calibration = effective_calibration(config.retrieval, encoder)
-        self._aligner = None if config.alignment.scope == "none" else Aligner(aerial_map, config.alignment)
+        self._threads = threads
+        self._aligner = (
+            None if config.alignment.scope == "none" else Aligner(aerial_map, config.alignment, threads=threads)
+        )
         self._tracker = Tracker(config.fusion)
         self._schedule = SearchSchedule(config.alignment)
 
@@ -75,7 +84,7 @@ class Localizer:
         watch.lap("encode_ms")
         found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
         candidates = _first(found, self.config.top_k)
-        place = judge(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
+        place = decide(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
@@ -113,7 +122,7 @@ class Localizer:
         if config.alignment.scope == "none":
             self._aligner = None
         elif self._aligner is None:
-            self._aligner = Aligner(self.aerial_map, config.alignment)
+            self._aligner = Aligner(self.aerial_map, config.alignment, threads=self._threads)
         else:
             self._aligner.reconfigure(config.alignment)
 
@@ -159,14 +168,14 @@ class Localizer:
         alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
         if alignment is None:
             return no_aligned_poses()
-        alignment.follow(hypotheses)
+        alignment.refine_hypotheses(hypotheses)
         if not self._tracker.skips:
             if schedule.around(stamp_ns) and config.scope != "map":
-                alignment.look_around()
-            if aligner.searches_everywhere:
-                is_enough = config.scope == "auto" and alignment.is_convincing()
+                alignment.search_candidates()
+            if aligner.searches_map:
+                is_enough = config.scope == "auto" and alignment.is_sufficient()
                 if not is_enough and schedule.everywhere(stamp_ns):
-                    alignment.look_everywhere()
+                    alignment.search_map()
         return alignment.result()
 
     def _within_turn(self, stamp_ns: int, motion: Motion | None) -> Float64Array:

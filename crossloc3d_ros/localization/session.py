@@ -18,7 +18,7 @@ from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.localization.estimates import no_estimate
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
-from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
 
 OdometryKind = Literal["topic", "scan", "none"]

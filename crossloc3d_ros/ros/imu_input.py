@@ -14,7 +14,7 @@ from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.errors import CrossLocError, PoseError
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.gravity import is_gravity
-from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.ros.poses import heading_prior, stamp_of
 from crossloc3d_ros.ros.subscriptions import REPEAT_REASON_S, subscribe
 from crossloc3d_ros.types import Float64Array

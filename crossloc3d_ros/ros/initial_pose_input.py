@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import ConfigError, PoseError
-from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.ros.poses import EARTH_FRAME_ID, initial_pose, stamp_of
 from crossloc3d_ros.ros.subscriptions import subscribe
 from crossloc3d_ros.ros.transforms import TransformSource

@@ -22,7 +22,7 @@ from std_srvs.srv import Empty
 from crossloc3d_ros.aerial_map.store import AerialMap, read_manifest
 from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.errors import ConfigError, CrossLocError
-from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import Session
 from crossloc3d_ros.ros.diagnostics import (
@@ -58,7 +58,7 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
 
     weights = Path(config.weights) if config.weights else None
     encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
-    return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config)
+    return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config, threads=config.threads)
 
 
 @dataclass(frozen=True, eq=False)

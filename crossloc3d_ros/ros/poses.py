@@ -13,7 +13,7 @@ from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.errors import PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.fusion.tracking import PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.ros.conversions import in_grid
 from crossloc3d_ros.types import Float64Array
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, PreprocessingConfig, ScanConfig
 from crossloc3d_ros.datasets.pose_sets import PoseSet
@@ -105,7 +106,7 @@ def prepared_of(scan: RawScan) -> PreparedScan:
 def is_right(aligned: AlignedPoses, scan: RawScan) -> np.ndarray:
     """Return which aligned poses (p,) are those of the scan."""
     away = np.hypot(*(aligned.grid[:, :2] - scan.T_grid_base[:2, 3]).T)
-    turned = np.abs((aligned.heading_rad - scan.heading_rad + np.pi) % (2.0 * np.pi) - np.pi)
+    turned = np.abs(wrap(aligned.heading_rad - scan.heading_rad))
     return np.asarray((away <= RIGHT_M) & (turned <= RIGHT_RAD))
 
 
@@ -151,7 +152,7 @@ def _answer(aligner: Aligner, scan: RawScan, on_map: bool) -> Answer | None:
     """Seek one scan on the whole map."""
     prepared, T = prepared_of(scan), scan.T_base_lidar
     sensor_xy = float(T[0, 3]), float(T[1, 3])
-    aligned = aligner.align(prepared, sensor_xy, no_candidates(), everywhere=True)
+    aligned = aligner.align(prepared, sensor_xy, no_candidates(), search_map=True)
     if not len(aligned):
         return None
     expected = float(aligner.model.expected @ fine_counts(prepared, sensor_xy))

@@ -23,15 +23,16 @@ from scipy import ndimage
 
 from crossloc3d_ros.aerial_map.geotiff import write_geotiff
 from crossloc3d_ros.aerial_map.store import TERRAIN, AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.raster import Bounds
 from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
 from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.errors import CloudError, MapError
-from crossloc3d_ros.localization.alignment.pose_search import wrapped
+from crossloc3d_ros.localization.fusion.decision import RIGHT_WITHIN_M
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
-from crossloc3d_ros.localization.fusion.tracking import RIGHT_WITHIN_M, PosePrior
+from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.vlp16 import Vlp16
@@ -211,7 +212,7 @@ def lost(robot: Robot, places: Iterable[int], **changes: Any) -> list[Told]:
     for place in places:
         told += robot.drive([place], **changes)
         if told[-1].estimate.state is TrackState.LOST:
-            says(told[-1:], "the place that was believed no longer fits the scans")
+            says(told[-1:], "the tracked pose no longer fits the scans")
             no_fix_is_wrong(told)
             no_fix(told[-5:])
             return told
@@ -262,10 +263,10 @@ def test_odometry_that_drifts_by_a_fifth(ride: Ride, share: float, words: str) -
     told = robot.drive(robot.ahead(30), step=drifting)
     no_fix_is_wrong(told)
     assert all(t.is_fix for t in told), said(told)  # it is seen through
-    spoken = [t.estimate.reason for t in told if "the odometry's ways are" in t.estimate.reason]
+    spoken = [t.estimate.reason for t in told if "the odometry's distances are" in t.estimate.reason]
     assert len(spoken) >= 5, said(told)
     for reason in spoken:
-        clause = re.search(r"; the odometry's ways are (\d+)% (.*)$", reason)
+        clause = re.search(r"; the odometry's distances are (\d+)% (.*)$", reason)
         assert clause is not None
         assert clause[2] == words
         assert int(clause[1]) == pytest.approx(20, abs=6)
@@ -318,7 +319,7 @@ def test_a_compass_that_counts_clockwise_from_north(ride: Ride) -> None:
 
     for T in ride.ways[:8, -1]:
         heading = math.atan2(T[1, 0], T[0, 0])
-        assert abs(wrapped(clockwise(heading) - heading)) > math.radians(60.0)
+        assert abs(wrap(clockwise(heading) - heading)) > math.radians(60.0)
     alone, robot = Robot(ride), Robot(ride)
     [without], [misled] = alone.drive(alone.ahead(1)), robot.drive(robot.ahead(1), compass=clockwise)
     assert 1.0 - misled.estimate.probability > 2.0 * (1.0 - without.estimate.probability)
@@ -344,7 +345,7 @@ def test_scans_upside_down_from_the_start(ride: Ride) -> None:
     robot = Robot(ride)
     told = robot.drive(robot.ahead(12), points=upside_down)
     no_fix(told)
-    says(told, "nothing fits well")
+    says(told, "no pose fits the scans well")
     assert {t.estimate.state for t in told} == {TrackState.SEARCHING}
     found(robot, robot.ahead(20))
 
@@ -383,7 +384,7 @@ def test_a_recording_that_begins_anew(ride: Ride) -> None:
     robot.clock_ns -= 3600 * SECOND
     told = robot.drive(robot.ahead(9))
     no_fix(told)
-    says(told[:1], "has explained only 0.0 m")  # nothing of before counts
+    says(told[:1], "has explained the scans over only 0.0 m")  # nothing of before counts
     found(robot, robot.ahead(8))
 
 
@@ -430,7 +431,7 @@ def test_a_map_whose_terrain_is_unknown(ride: Ride, tmp_path: Path) -> None:
     aerial_map = changed_map(ride.aerial_map, tmp_path, lambda t, s, _: (np.full_like(t, np.nan), s))
     told = Robot(ride, aerial_map).drive(range(10))
     no_fix(told)
-    says(told, "nothing in the map fits the scan")
+    says(told, "no pose on the map fits the scan")
     assert {t.estimate.state for t in told} == {TrackState.SEARCHING}
 
 
@@ -441,7 +442,7 @@ def test_a_map_whose_terrain_is_unknown_in_one_half(ride: Ride, tmp_path: Path) 
     robot = Robot(ride, changed_map(ride.aerial_map, tmp_path, without))
     told = robot.drive(range(90, 79, -1))
     no_fix(told)
-    says(told, "nothing fits well")
+    says(told, "no pose fits the scans well")
     found(robot, range(79, -1, -1))
 
 
@@ -512,7 +513,7 @@ def test_a_town_that_is_hardly_the_same(ride: Ride, tmp_path: Path) -> None:
     robot = Robot(ride, changed_map(ride.aerial_map, tmp_path, other_town(ride, 0.6)))
     told = robot.drive(robot.ahead(16))
     no_fix(told)
-    says(told, "nothing fits well")
+    says(told, "no pose fits the scans well")
     assert {t.estimate.state for t in told} == {TrackState.SEARCHING}
 
 

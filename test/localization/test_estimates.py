@@ -18,8 +18,8 @@ from crossloc3d_ros.localization.estimates import (
     placed_estimate,
     posed_estimate,
 )
-from crossloc3d_ros.localization.fusion import tracking
-from crossloc3d_ros.localization.retrieval import place_belief as credibility
+from crossloc3d_ros.localization.fusion.decision import Belief
+from crossloc3d_ros.localization.retrieval.place_belief import PlaceBelief
 from crossloc3d_ros.types import (
     Estimate,
     FixStatus,
@@ -35,21 +35,21 @@ ORIGIN = np.array(
     [500_000.0 + 130_000.0, 5_803_000.0, 31.0]
 )  # 1.9 degrees off the zone's middle: grid and true north differ
 FRAME = MapFrame("EPSG:32631", ORIGIN, 43.0)
-PLACE = credibility.Belief(
+PLACE = PlaceBelief(
     status=FixStatus.FIX, reason="a place", probability=0.5, enu=np.array([300.0, -200.0, 4.0]),
     covariance=np.diag([400.0, 400.0, 9.0]), members=np.ones(1, np.bool_),
 )  # fmt: skip
 
 
-def belief(grid: list[float], heading: float = 0.6, is_fix: bool = True) -> tracking.Belief:
+def belief(grid: list[float], heading: float = 0.6, is_fix: bool = True) -> Belief:
     A = np.random.default_rng(0).normal(size=(3, 3))
-    return tracking.Belief(
+    return Belief(
         state=TrackState.LOCALIZED, reason="", probability=0.9995, grid=np.array(grid), heading_rad=heading,
         covariance=A @ A.T, hypotheses=no_hypotheses(), is_fix=is_fix,
     )  # fmt: skip
 
 
-def posed(about: tracking.Belief, gravity: Float64Array | None = None) -> Estimate:
+def posed(about: Belief, gravity: Float64Array | None = None) -> Estimate:
     return posed_estimate(
         7, FRAME, PLACE, no_candidates(), no_aligned_poses(), about, gravity, ScanCounts(received=3), Watch()
     )

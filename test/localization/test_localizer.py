@@ -13,6 +13,7 @@ import pytest
 
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.store import AerialMap, BuildCounts, Manifest, SubmapTable
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import (
     AlignmentConfig,
@@ -26,7 +27,6 @@ from crossloc3d_ros.datasets.pose_sets import PoseSet, placed_town
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.simulated import BenchmarkTown
 from crossloc3d_ros.geodesy import MapFrame
-from crossloc3d_ros.localization.alignment.pose_search import wrapped
 from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.localizer import Localizer, SearchSchedule
 from crossloc3d_ros.simulation.vlp16 import Vlp16
@@ -159,7 +159,7 @@ def test_a_scan_from_nowhere_gives_no_fix(localizer: Localizer) -> None:
     box[:4500, 0] = 3.0
     estimate = localizer.localize(Scan(box.astype(np.float32), STAMP_NS, "velodyne"))
     assert estimate.status is FixStatus.NO_FIX
-    assert "nothing in the map looks like the scan" in estimate.reason
+    assert "no submap resembles the scan" in estimate.reason
     assert len(estimate.candidates) == 25
 
 
@@ -200,7 +200,7 @@ def seen(localizer: Localizer, scan: RawScan, stamp_ns: int = STAMP_NS, motion: 
 
 
 def is_right(scan: RawScan, grid: npt.NDArray[np.float64], heading_rad: float) -> bool:
-    turned = abs(wrapped(heading_rad - scan.heading_rad))
+    turned = abs(wrap(heading_rad - scan.heading_rad))
     return bool(np.hypot(*(grid[:2] - scan.T_grid_base[:2, 3])) < 2.0 and turned < np.radians(5.0))
 
 

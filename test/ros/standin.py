@@ -24,7 +24,7 @@ from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
 from crossloc3d_ros.localization.retrieval.place_belief import effective_calibration
-from crossloc3d_ros.types import EXHAUSTIVE, AlignedPoses, Estimate, FixStatus, Hypotheses, Scan, TrackState
+from crossloc3d_ros.types import WHOLE_MAP, AlignedPoses, Estimate, FixStatus, Hypotheses, Scan, TrackState
 
 HEADING_RAD = 0.5
 """Of every pose that it makes up, from grid east."""
@@ -79,7 +79,7 @@ class StandIn:
         every = np.ones(k, bool)
         # Two of them fit around the first candidate, none around the last; one was found without any.
         source = np.arange(k) - 1
-        source[0], source[1] = 0, EXHAUSTIVE
+        source[0], source[1] = 0, WHOLE_MAP
         aligned = AlignedPoses(
             grid, heading, covariance, likelihood, candidates.probabilities, np.ones(k), every, source
         )

@@ -129,7 +129,7 @@ def test_a_learned_model_finds_its_scans_and_doubts_the_others(pose_set: PoseSet
     aligner = Aligner(AerialMap.load(pose_set.map_folder), AlignmentConfig(), learned[0])
     for scan in pose_set.scans[::3]:
         T = scan.T_base_lidar
-        found = aligner.align(prepared_of(scan), (float(T[0, 3]), float(T[1, 3])), no_candidates(), everywhere=True)
+        found = aligner.align(prepared_of(scan), (float(T[0, 3]), float(T[1, 3])), no_candidates(), search_map=True)
         if pose_set.on_map[scan.area]:
             assert is_right(found, scan)[0]
         else:

@@ -20,11 +20,12 @@ from typing import Any, Self
 
 import numpy as np
 
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     BoolArray,
     Estimate,
@@ -176,7 +177,7 @@ class EstimateTable:
     @property
     def heading_error_rad(self) -> Float64Array:
         """Signed heading error (S,) in [-pi, pi], NaN where either is unknown."""
-        return wrapped(self.heading_rad - self.truth_heading_rad)
+        return wrap(self.heading_rad - self.truth_heading_rad)
 
     @property
     def latency_ms(self) -> Float64Array:
@@ -190,7 +191,7 @@ class EstimateTable:
         The likeliest aligned pose whose search did not begin at a hypothesis, which earlier scans have led to.
         """
         grid, heading = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
-        alone = (self.aligned_sources >= 0) | (self.aligned_sources == EXHAUSTIVE)
+        alone = (self.aligned_sources >= 0) | (self.aligned_sources == WHOLE_MAP)
         for scan in np.flatnonzero(alone.any(axis=1)):
             first = int(alone[scan].argmax())
             grid[scan], heading[scan] = self.aligned.grid[scan, first], self.aligned.heading_rad[scan, first]
@@ -298,7 +299,7 @@ def add_truth(
     if known.any():
         latitude[known], longitude[known], _ = frame.to_geographic(places[known])
     errors = np.hypot(*(table.grid[:, :2] - truth_grid[:, :2]).T)
-    heading_errors = wrapped(table.heading_rad - headings)
+    heading_errors = wrap(table.heading_rad - headings)
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     text = io.StringIO()
@@ -392,11 +393,6 @@ def write_geojson(path: Path, table: EstimateTable, frame: MapFrame, candidates:
                 }
             )
     write_atomically(path, json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False))
-
-
-def wrapped(angle_rad: Float64Array) -> Float64Array:
-    """Return angles as the same angles in [-pi, pi]."""
-    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
 
 
 def heading_of(T_map_base: Float64Array) -> float:

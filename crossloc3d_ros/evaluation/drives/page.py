@@ -12,9 +12,10 @@ import numpy as np
 from markupsafe import Markup
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.datasets.truth import TruthTrack
 from crossloc3d_ros.evaluation.drives import charts
-from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, wrapped
+from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
 from crossloc3d_ros.evaluation.drives.evaluation import Evaluation
 from crossloc3d_ros.evaluation.drives.page_map import MapView, grid_turn_rad, map_view, page_data
 from crossloc3d_ros.evaluation.drives.track_scores import CARRIED, FROM_NOTHING, LOST, WRONG_M, Search, TrackScores
@@ -172,7 +173,7 @@ def measure_steps(table: EstimateTable, frame: MapFrame) -> Steps:
     candidates = horizontal_distances(table.candidate_grid, table.truth_grid)
     place, heading = table.first_aligned
     aligned = np.hypot(*(place - table.truth_grid).T)
-    turned = np.abs(np.degrees(wrapped(heading - table.truth_heading_rad - grid_turn_rad(table, frame))))
+    turned = np.abs(np.degrees(wrap(heading - table.truth_heading_rad - grid_turn_rad(table, frame))))
     nowhere = np.full(len(table), np.inf)
     retrieval = _step(known, candidates[:, 0] if candidates.shape[1] else nowhere, nowhere)
     return Steps(

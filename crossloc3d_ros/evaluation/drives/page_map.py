@@ -15,7 +15,7 @@ from crossloc3d_ros.evaluation.recall import CHI2_2D_95
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.pages.backdrop import Backdrop
 from crossloc3d_ros.pages.wording import rounded
-from crossloc3d_ros.types import EXHAUSTIVE, BoolArray, Float64Array
+from crossloc3d_ros.types import WHOLE_MAP, BoolArray, Float64Array
 
 SHOWN_CANDIDATES = 10
 SHOWN_POSES = 6
@@ -117,7 +117,7 @@ def page_data(table: EstimateTable, backdrop: Backdrop, chosen: list[int], frame
         "reasons": list(reasons),
         "classes": [*limits, {"limit": None, "name": WORST}],
         "states": {state.value: words for state, words in STATE_WORDS.items()},
-        "exhaustive": EXHAUSTIVE,
+        "exhaustive": WHOLE_MAP,
         "tracked": table.has_track,
         "shown": SHOWN_CANDIDATES,
         "top": top,

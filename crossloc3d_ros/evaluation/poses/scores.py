@@ -18,7 +18,7 @@ from crossloc3d_ros.evaluation.poses.predictions import SINGLE, PoseAbout, PoseP
 from crossloc3d_ros.evaluation.recall import independent_places, squared_mahalanobis
 from crossloc3d_ros.evaluation.retrieval.scores import bootstrap_draws, clusters_among, share_of
 from crossloc3d_ros.simulation.families import HELD_OUT_FAMILIES
-from crossloc3d_ros.types import EXHAUSTIVE, BoolArray, Float64Array, Int64Array
+from crossloc3d_ros.types import WHOLE_MAP, BoolArray, Float64Array, Int64Array
 
 WITHIN_M, WITHIN_DEG = 2.0, 5.0
 """A pose that is at most so far from the truth is right."""
@@ -198,7 +198,7 @@ def retrieved(predictions: PosePredictions) -> Float64Array:
 def first_aligned(predictions: PosePredictions) -> Float64Array:
     """Return the best pose (N, 3) within 50 m of the foremost candidate that has one so near."""
     source = predictions.aligned_source
-    own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == EXHAUSTIVE))
+    own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == WHOLE_MAP))
     answer = np.full((len(predictions), 3), np.nan)
     for place in np.moveaxis(predictions.candidates, 1, 0)[::-1]:  # the foremost last: it has the last word
         offsets = predictions.aligned[:, :, :2] - place[:, None, :]
@@ -216,7 +216,7 @@ def best_aligned(predictions: PosePredictions) -> Float64Array:
 def whole_map_share(predictions: PosePredictions) -> float:
     """Return the share of the scans whose best pose a search of the whole map has found."""
     found = np.isfinite(predictions.aligned[:, 0, 0])
-    return float(np.mean(predictions.aligned_source[found, 0] == EXHAUSTIVE)) if found.any() else math.nan
+    return float(np.mean(predictions.aligned_source[found, 0] == WHOLE_MAP)) if found.any() else math.nan
 
 
 STAGES: dict[str, Callable[[PosePredictions], Float64Array]] = {

@@ -1,8 +1,8 @@
 """From places to poses: where exactly, and in which heading, a scan fits the aerial map.
 
-The surroundings of all candidates, or the whole map, are searched exhaustively in coarse cells; what fits best is
-climbed to its top in fine ones. The score's height above what a scan from elsewhere would get becomes a likelihood, its
-shape a covariance.
+The surroundings of all candidates, or the whole map, are searched exhaustively in coarse cells; the best poses are
+refined by hill climbing in fine ones. The score becomes a likelihood, by how far it is above that of a scan from
+elsewhere, and the shape of its maximum a covariance.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig, usable_threads
 from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
@@ -29,10 +30,10 @@ from crossloc3d_ros.localization.alignment.pose_search import (
     merge,
     scores_at,
     search_cells,
-    wrapped,
 )
+from crossloc3d_ros.localization.alignment.thread_pool import ThreadPool
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     BoolArray,
     Candidates,
@@ -42,31 +43,47 @@ from crossloc3d_ros.types import (
     no_aligned_poses,
 )
 
-COARSE_RETURNS, COARSE_PASSAGES = 160, 200
-_MIDDLE_RETURNS, _MIDDLE_PASSAGES = 500, 500
-_CLIMB_RETURNS, _CLIMB_PASSAGES = 600, 700
-_FINE_RETURNS, _FINE_PASSAGES = 2000, 3000
+COARSE_HITS, COARSE_FREE = 160, 200
+"""Evidence of the coarse search: its time is proportional, and its sums stay within 16 bits."""
+_MIDDLE_HITS, _MIDDLE_FREE = 500, 500  # more poses are compared, but only around each coarse one
+_CLIMB_HITS, _CLIMB_FREE = 600, 700  # enough to find the maximum; the scores themselves are taken of the fine evidence
+_FINE_HITS, _FINE_FREE = 2000, 3000  # what a scan of 16 rings has, about: beyond, cells are hardly independent
 COARSE_HEADINGS = 48
-_APART_M = 8.0
-PEAKS_EVERYWHERE, POSES_EVERYWHERE = 4, 2  # so many times as many on the whole map as around candidates
-_PLACE_M = 35.0  # so far from the centre of its submap a pose still is of its place
-_UNSEEN = 0.2  # likelihood ratio of a place that is not among the candidates
-_SAME_M, _SAME_RAD = 3.0, math.radians(12.0)
+"""7.5 degrees: at 30 m, a step of one coarse cell."""
+_APART_M = 8.0  # two coarse cells: nearer ones climb to the same maximum
+_MIDDLE_REACH_M, _MIDDLE_REACH_RAD = 4.0, math.radians(7.5)  # a coarse cell and a step of its headings
+_MIDDLE_HEADINGS = 2  # tried to either side
+MAP_COARSE_FACTOR, MAP_FINE_FACTOR = 4, 2
+"""So many times as many maxima are refined on the whole map as around candidates."""
+_PLACE_M = 35.0  # so far from the centre of its submap a pose is still of its place
+_NOT_RETRIEVED = 0.2  # likelihood ratio of a place that is not among the candidates
+_SAME_M, _SAME_RAD = 3.0, math.radians(12.0)  # poses this near belong to one maximum
+# Where the score is sampled for the covariance: about two standard deviations of a good pose to each side.
 _SHAPE_STEPS_M = np.array([-1.2, -0.6, 0.0, 0.6, 1.2])
 _SHAPE_STEPS_RAD = np.radians([-1.5, 0.0, 1.5])
 _SHAPE = np.stack(np.meshgrid(_SHAPE_STEPS_M, _SHAPE_STEPS_M, _SHAPE_STEPS_RAD, indexing="ij"), -1).reshape(-1, 3)
-_LEAST_STD_M, _LEAST_STD_RAD = 0.1, math.radians(0.2)
+_MIN_STD_M, _MIN_STD_RAD = 0.1, math.radians(0.2)  # below the last step of the climb nothing is known
 
 
 class Aligner:
     """Align scans with one aerial map."""
 
-    def __init__(self, aerial_map: AerialMap, config: AlignmentConfig, model: ObservationModel | None = None) -> None:
-        """Bring map and observation model (the shipped one by default) together."""
+    def __init__(
+        self,
+        aerial_map: AerialMap,
+        config: AlignmentConfig,
+        model: ObservationModel | None = None,
+        *,
+        threads: int = 0,
+    ) -> None:
+        """Bring map and observation model (the shipped one by default) together.
+
+        `threads` work on a scan; 0 = `usable_threads()`. With one, all is done in the caller's thread.
+        """
         self.aerial_map = aerial_map
         self.model = model or ObservationModel.load()
         self.likelihood = MapLikelihood(aerial_map, self.model)
-        self.threads = usable_threads()
+        self.pool = ThreadPool(threads or usable_threads())
         west, south, east, north = aerial_map.bounds
         self.area_m2 = (east - west) * (north - south)
         self.reconfigure(config)
@@ -77,23 +94,23 @@ class Aligner:
         self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
 
     @property
-    def searches_everywhere(self) -> bool:
-        """Whether the whole map is searched at times: told to, or left the choice and the map is not too large."""
+    def searches_map(self) -> bool:
+        """Whether the whole map is ever searched: by the scope `map`, or `auto` where the map is small."""
         small = self.area_m2 <= 1e6 * self.config.map_max_km2
         return self.config.scope == "map" or (self.config.scope == "auto" and small)
 
     def warm_up(self) -> None:
-        """Read what an exhaustive search needs, so that the first scan does not wait for it."""
-        if self.searches_everywhere:
+        """Read what a search of the whole map needs, so that the first scan does not wait for it."""
+        if self.searches_map:
             self.likelihood.prepare()
 
     def begin(
         self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Candidates
     ) -> Alignment | None:
-        """Return the alignment of a scan, which has looked nowhere yet; None for a scan that saw too little.
+        """Return the alignment of a scan, without any search yet; None for a scan of too little evidence.
 
-        `sensor_xy_m`: where the sensor is on the base. The candidates' own shares of belief count wherever the poses
-        come from.
+        `sensor_xy_m`: where the sensor is on the base. The candidates' probabilities count wherever the poses come
+        from.
         """
         evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
         if len(evidence) < self.config.min_cells:
@@ -107,20 +124,24 @@ class Aligner:
         candidates: Candidates,
         hypotheses: Hypotheses | None = None,
         *,
-        around: bool = True,
-        everywhere: bool = False,
+        search_candidates: bool = True,
+        search_map: bool = False,
     ) -> AlignedPoses:
-        """Return where the scan fits, best first: `around` the candidates' places, `everywhere`, at the hypotheses."""
+        """Return where the scan fits, best first: around the candidates, on the whole map, at the hypotheses."""
         alignment = self.begin(prepared, sensor_xy_m, candidates)
         if alignment is None:
             return no_aligned_poses()
-        if around:
-            alignment.look_around()
-        if everywhere:
-            alignment.look_everywhere()
+        if search_candidates:
+            alignment.search_candidates()
+        if search_map:
+            alignment.search_map()
         if hypotheses is not None:
-            alignment.follow(hypotheses)
+            alignment.refine_hypotheses(hypotheses)
         return alignment.result()
+
+    def close(self) -> None:
+        """End the threads."""
+        self.pool.close()
 
     def prepare(self, places: Float64Array) -> None:
         """Have the map read around places (k, 3); those that are not finite are none."""
@@ -140,45 +161,45 @@ class Aligner:
 
 
 class Alignment:
-    """The alignment of one scan, look by look: what one look found is known to the next."""
+    """The alignment of one scan, search by search: each builds on what the ones before found."""
 
     def __init__(self, aligner: Aligner, evidence: Evidence, candidates: Candidates) -> None:
-        """Look nowhere yet."""
-        self._aligner, self._config, self._threads = aligner, aligner.config, aligner.threads
+        """Search nowhere yet."""
+        self._aligner, self._config, self._pool = aligner, aligner.config, aligner.pool
         self._likelihood = aligner.likelihood
         self._evidence, self._candidates = evidence, candidates
         self._places = aligner.local(candidates.grid[:, :2])
         self._fine = fine_evidence(evidence)
-        self._some = self._fine.some(_CLIMB_RETURNS, _CLIMB_PASSAGES)
-        self._nearer, self._is_climbed = _no_peaks(), np.empty(0, np.bool_)
-        self._most_climbed = 0
-        self._found, self._followed = _no_climbed(), _no_climbed()
+        self._climb_evidence = self._fine.sample(_CLIMB_HITS, _CLIMB_FREE)
+        self._maxima, self._is_refined = _no_peaks(), np.empty(0, np.bool_)
+        self._most_refined = 0
+        self._found, self._tracked = _no_poses(), _no_poses()
 
-    def look_around(self) -> None:
-        """Seek poses around the candidates' places."""
+    def search_candidates(self) -> None:
+        """Search for poses around the candidates' places."""
         if not len(self._places):
             return
         self._aligner.prepare(self._candidates.grid)
         coarse = self._likelihood.levels[0]
         runs = around(self._likelihood, coarse, self._places, self._config.candidate_radius_m)
-        self._look(runs, self._config.coarse_maxima, self._config.fine_maxima)
+        self._search(runs, self._config.coarse_maxima, self._config.fine_maxima)
 
-    def look_everywhere(self) -> None:
-        """Seek poses on the whole map."""
+    def search_map(self) -> None:
+        """Search for poses on the whole map."""
         self._likelihood.prepare()
         runs = inside(self._likelihood, self._likelihood.levels[0])
-        self._look(runs, PEAKS_EVERYWHERE * self._config.coarse_maxima, POSES_EVERYWHERE * self._config.fine_maxima)
+        self._search(runs, MAP_COARSE_FACTOR * self._config.coarse_maxima, MAP_FINE_FACTOR * self._config.fine_maxima)
 
-    def follow(self, hypotheses: Hypotheses) -> None:
-        """Seek one pose for each hypothesis; those off the map as NaN are left to the climb."""
+    def refine_hypotheses(self, hypotheses: Hypotheses) -> None:
+        """Refine each hypothesis to one pose; one that is off the map or NaN stays where it is."""
         if len(hypotheses):
             self._aligner.prepare(hypotheses.grid)
             poses = np.column_stack([self._aligner.local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
-            self._followed = self._climbed(poses, -1 - np.arange(len(poses)))
+            self._tracked = self._refined(poses, -1 - np.arange(len(poses)))
 
-    def is_convincing(self) -> bool:
-        """Whether a pose is believed enough to leave the rest of the map alone."""
-        probabilities = self._weighed()[2]
+    def is_sufficient(self) -> bool:
+        """Return whether one pose is probable enough that the rest of the map need not be searched."""
+        probabilities = self._weighted()[2]
         return bool(len(probabilities)) and float(probabilities.max()) >= self._config.sufficient_probability
 
     def result(self) -> AlignedPoses:
@@ -186,74 +207,76 @@ class Alignment:
 
         Every hypothesis has one pose of its own in the result, as far as it lies on the map.
         """
-        climbed, log_likelihood, probabilities = self._weighed()
-        if not len(climbed.poses):
+        refined, log_likelihood, probabilities = self._weighted()
+        if not len(refined.poses):
             return no_aligned_poses()
         expected = max(float(self._aligner.model.expected @ self._fine.counts()), 1e-9)
         return AlignedPoses(
-            grid=self._aligner.on_grid(climbed.poses),
-            heading_rad=np.array([wrapped(float(angle)) for angle in climbed.poses[:, 2]]),
-            covariance=self._covariances(climbed.poses),
+            grid=self._aligner.on_grid(refined.poses),
+            heading_rad=_headings(refined.poses[:, 2]),
+            covariance=self._covariances(refined.poses),
             log_likelihood=log_likelihood,
             probabilities=probabilities,
-            inliers=np.clip(climbed.scores / expected, 0.0, 1.0),
-            converged=climbed.rested,
-            source=climbed.source,
+            inliers=np.clip(refined.scores / expected, 0.0, 1.0),
+            converged=refined.converged,
+            source=refined.source,
             log_prior=self._aligner.log_prior,
         )
 
-    def _look(self, runs: Int64Array, most: int, best: int) -> None:
-        """Seek `most` poses in the runs of coarse cells, and climb from the `best` that were not climbed from."""
+    def _search(self, runs: Int64Array, coarse_maxima: int, fine_maxima: int) -> None:
+        """Search the runs of coarse cells, and refine the best maxima that were not refined before."""
         coarse, middle = self._likelihood.levels
-        laid = self._evidence.coarser(coarse.cell_m, COARSE_RETURNS, COARSE_PASSAGES)
-        seeds = search_cells(laid, coarse, runs, COARSE_HEADINGS, most, _APART_M, self._threads)
+        evidence = self._evidence.coarser(coarse.cell_m, COARSE_HITS, COARSE_FREE)
+        seeds = search_cells(evidence, coarse, runs, COARSE_HEADINGS, coarse_maxima, _APART_M, self._pool)
         if not len(seeds.poses):
             return
-        finer = self._evidence.coarser(middle.cell_m, _MIDDLE_RETURNS, _MIDDLE_PASSAGES)
-        nearer = local_search(finer, middle, seeds.poses, 4.0, math.radians(7.5), 2, self._threads)
-        self._nearer = Peaks(*map(np.concatenate, zip(vars(self._nearer).values(), vars(nearer).values(), strict=True)))
-        self._is_climbed = np.append(self._is_climbed, np.zeros(len(nearer.scores), np.bool_))
-        self._most_climbed += best
-        merged = merge(self._nearer, 4.0, _SAME_RAD)[: self._most_climbed]
-        fresh = merged[~self._is_climbed[merged]]
-        self._is_climbed[fresh] = True
-        self._found = self._found.join(self._climbed(self._nearer.poses[fresh], None))
-
-    def _climbed(self, poses: Float64Array, source: Int64Array | None) -> _Climbed:
-        """Return where the climb from poses (p, 3) ends, and whether candidates lie there where no source is given."""
-        peaks, rested = climb(
-            self._some, self._likelihood, poses, reach_m=self._config.hypothesis_radius_m, threads=self._threads
+        evidence = self._evidence.coarser(middle.cell_m, _MIDDLE_HITS, _MIDDLE_FREE)
+        found = local_search(
+            evidence, middle, seeds.poses, _MIDDLE_REACH_M, _MIDDLE_REACH_RAD, _MIDDLE_HEADINGS, self._pool
         )
-        scores = scores_at(self._fine, self._likelihood, peaks.poses, self._threads)
+        self._maxima = Peaks(*map(np.concatenate, zip(vars(self._maxima).values(), vars(found).values(), strict=True)))
+        self._is_refined = np.append(self._is_refined, np.zeros(len(found.scores), np.bool_))
+        self._most_refined += fine_maxima
+        merged = merge(self._maxima, _MIDDLE_REACH_M, _SAME_RAD)[: self._most_refined]
+        fresh = merged[~self._is_refined[merged]]
+        self._is_refined[fresh] = True
+        self._found = self._found.join(self._refined(self._maxima.poses[fresh], None))
+
+    def _refined(self, poses: Float64Array, source: Int64Array | None) -> _Poses:
+        """Return where the climb from poses (p, 3) ends; without a source, the candidates near there are it."""
+        peaks, converged = climb(
+            self._climb_evidence, self._likelihood, poses, reach_m=self._config.hypothesis_radius_m, pool=self._pool
+        )
+        scores = scores_at(self._fine, self._likelihood, peaks.poses, self._pool)
         if source is None:
-            source = np.full(len(poses), EXHAUSTIVE, np.int64)
+            source = np.full(len(poses), WHOLE_MAP, np.int64)
             if len(self._places):
                 away = self._away(peaks.poses)
                 near = away.min(axis=1) <= 2.0 * self._config.candidate_radius_m
                 source[near] = away.argmin(axis=1)[near]
-        return _Climbed(peaks.poses, scores, rested, source)
+        return _Poses(peaks.poses, scores, converged, source)
 
-    def _weighed(self) -> tuple[_Climbed, Float64Array, Float64Array]:
+    def _weighted(self) -> tuple[_Poses, Float64Array, Float64Array]:
         """Return the poses that are kept, best first, with log likelihoods and probabilities."""
         found = self._found.take(merge(Peaks(self._found.poses, self._found.scores), _SAME_M, _SAME_RAD))
-        climbed = found.join(self._followed)
-        log_likelihood = self._aligner.model.log_likelihood(climbed.scores, self._fine.counts())
-        log_likelihood = log_likelihood + self._retrieved(climbed.poses)
+        poses = found.join(self._tracked)
+        log_likelihood = self._aligner.model.log_likelihood(poses.scores, self._fine.counts())
+        log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses)
         order = np.argsort(-log_likelihood, kind="stable")
-        climbed, log_likelihood = climbed.take(order), log_likelihood[order]
+        poses, log_likelihood = poses.take(order), log_likelihood[order]
         log_odds = log_likelihood + self._aligner.log_prior
-        # A hypothesis and a peak of the search may be one pose: it counts once.
-        near = are_near(climbed.poses, _SAME_M, _SAME_RAD)
+        # A hypothesis and a maximum of the search may be one pose: it counts once.
+        near = are_near(poses.poses, _SAME_M, _SAME_RAD)
         log_odds[np.tril(near, -1).any(axis=1)] = -np.inf
-        return climbed, log_likelihood, np.exp(log_odds - np.logaddexp(0.0, np.logaddexp.reduce(log_odds)))
+        return poses, log_likelihood, np.exp(log_odds - np.logaddexp(0.0, np.logaddexp.reduce(log_odds)))
 
-    def _retrieved(self, poses: Float64Array) -> Float64Array:
-        """Return the log likelihood ratios (p,) that the descriptors give: belief near a pose over that by lot."""
+    def _descriptor_log_ratios(self, poses: Float64Array) -> Float64Array:
+        """Return the log likelihood ratios (p,) of the descriptors: probability near a pose over chance level."""
         if not len(self._places):
             return np.zeros(len(poses))
-        believed = (self._away(poses) <= _PLACE_M) @ self._candidates.probabilities
-        by_lot = min(math.pi * _PLACE_M**2 / self._aligner.area_m2, 1.0)
-        return np.asarray(self._config.descriptor_weight * np.log(believed / by_lot + _UNSEEN))
+        retrieved = (self._away(poses) <= _PLACE_M) @ self._candidates.probabilities
+        chance = min(math.pi * _PLACE_M**2 / self._aligner.area_m2, 1.0)
+        return np.asarray(self._config.descriptor_weight * np.log(retrieved / chance + _NOT_RETRIEVED))
 
     def _away(self, poses: Float64Array) -> Float64Array:
         """Return distances (p, k) of poses from the candidates' places; infinite where either is none."""
@@ -263,42 +286,42 @@ class Alignment:
     def _covariances(self, poses: Float64Array) -> Float64Array:
         """Return the covariances (p, 3, 3) of poses from the shape of the score around them."""
         around_them = (poses[:, None] + _SHAPE).reshape(-1, 3)
-        scores = scores_at(self._some, self._likelihood, around_them, self._threads).reshape(len(poses), -1)
-        scores *= len(self._fine) / max(len(self._some), 1)  # some of the cells stand for all
+        scores = scores_at(self._climb_evidence, self._likelihood, around_them, self._pool).reshape(len(poses), -1)
+        scores *= len(self._fine) / max(len(self._climb_evidence), 1)  # a sample of the cells stands for all
         weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.covariance_temperature)
         weights /= weights.sum(axis=1, keepdims=True)
         offsets = _SHAPE - (weights @ _SHAPE)[:, None]
         spread = np.einsum("ps,psi,psj->pij", weights, offsets, offsets)
-        return np.asarray(spread + np.diag([_LEAST_STD_M**2, _LEAST_STD_M**2, _LEAST_STD_RAD**2]))
+        return np.asarray(spread + np.diag([_MIN_STD_M**2, _MIN_STD_M**2, _MIN_STD_RAD**2]))
 
 
 @dataclass(frozen=True, eq=False)
-class _Climbed:
-    """Where climbs ended."""
+class _Poses:
+    """Refined poses."""
 
     poses: Float64Array
     """(p, 3) local metres, radians."""
     scores: Float64Array
     """(p,) nats, of the fine evidence."""
-    rested: BoolArray
-    """(p,) whether the climb came to rest near where it began."""
+    converged: BoolArray
+    """(p,) whether the climb converged near where it began."""
     source: Int64Array
     """(p,) as `AlignedPoses` has it."""
 
-    def take(self, rows: Int64Array) -> _Climbed:
-        return _Climbed(*(values[rows] for values in vars(self).values()))
+    def take(self, rows: Int64Array) -> _Poses:
+        return _Poses(*(values[rows] for values in vars(self).values()))
 
-    def join(self, other: _Climbed) -> _Climbed:
+    def join(self, other: _Poses) -> _Poses:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return _Climbed(*(np.concatenate(pair) for pair in pairs))
+        return _Poses(*(np.concatenate(pair) for pair in pairs))
 
 
 def _no_peaks() -> Peaks:
     return Peaks(np.empty((0, 3)), np.empty(0))
 
 
-def _no_climbed() -> _Climbed:
-    return _Climbed(np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_), np.empty(0, np.int64))
+def _no_poses() -> _Poses:
+    return _Poses(np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_), np.empty(0, np.int64))
 
 
 def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int64Array:
@@ -308,7 +331,7 @@ def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int
 
 def fine_evidence(evidence: Evidence) -> Evidence:
     """Return as much of the evidence as poses are compared by at the end."""
-    return evidence.some(_FINE_RETURNS, _FINE_PASSAGES)
+    return evidence.sample(_FINE_HITS, _FINE_FREE)
 
 
 def moved(aligned: AlignedPoses, step: Float64Array) -> AlignedPoses:
@@ -317,5 +340,9 @@ def moved(aligned: AlignedPoses, step: Float64Array) -> AlignedPoses:
     grid = aligned.grid.copy()
     grid[:, 0] += c * step[0] - s * step[1]
     grid[:, 1] += s * step[0] + c * step[1]
-    heading = np.array([wrapped(float(angle)) for angle in aligned.heading_rad + step[2]])
-    return dataclasses.replace(aligned, grid=grid, heading_rad=heading)
+    return dataclasses.replace(aligned, grid=grid, heading_rad=_headings(aligned.heading_rad + step[2]))
+
+
+def _headings(angle_rad: Float64Array) -> Float64Array:
+    """Return angles in (-pi, pi]: west is pi, as `atan2` has it."""
+    return 0.0 - wrap(-angle_rad)  # not -wrap(...), which has a negative zero

@@ -1,8 +1,8 @@
-"""What a scan says about the ground plan around it: where its beams were returned, and what they passed through.
+"""The evidence of a scan: the cells that its beams hit, and the free space that they passed through.
 
-Everything is cut into cells of a horizontal grid and into layers of height above the ground. A beam that returned
-from a layer of a cell is a return there; one that flew through it and returned from farther away is a passage. Both
-are evidence: a return asks for something that stands there, a passage refutes what the map has there.
+Space is divided into cells of a horizontal grid and into layers of height above the ground. A beam that ends in a layer
+of a cell is a hit there; one that passes through it and ends farther away shows free space. Both are evidence: a hit is
+likely where something stands on the map, free space where nothing does.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from numba import njit
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 LAYERS_M = np.array([0.5, 1.5, 3.0, 6.0, 50.0], np.float32)
-"""(L + 1,) heights above the ground between which the L layers lie."""
+"""(L + 1,) heights above the ground between which the L layers lie: thinner near the ground, where robots see most."""
 LAYERS = len(LAYERS_M) - 1
 CHANNELS = 2 * LAYERS
-"""Returns of each layer, then passages of each."""
+"""Hits of each layer, then free space of each."""
 CELL_M = 1.0
+"""As the rasters of most surveys."""
 REACH_M = 100.0
+"""Range within which most lidars of robots hit anything."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The cells that a scan saw, each once a channel."""
+    """The cells that a scan hit or passed through, each once a channel."""
 
     xy_m: Float64Array
     """(n, 2) middles of the cells, metres from the base, x along the robot's heading, y to its left."""
@@ -36,23 +38,23 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.channel)
 
-    def coarser(self, cell_m: float, most_returns: int, most_passages: int) -> Evidence:
-        """Return the evidence in cells of `cell_m`, the passages in blocks of 2 x 2 of them; at most so many of each.
+    def coarser(self, cell_m: float, max_hits: int, max_free: int) -> Evidence:
+        """Return the evidence in cells of `cell_m`, free space in blocks of 2 x 2 of them; at most so many of each.
 
-        A block counts where beams passed through half of its cells or more. Which are left out, where there are more,
-        is drawn by lot, the same at each call.
+        A block is free where beams passed through half of its cells or more. Which are left out, where there are more,
+        is random, and the same at each call.
         """
-        returns = _unique_cells(self.xy_m, self.channel, self.channel < LAYERS, cell_m, cell_m, 1)
-        passages = _unique_cells(self.xy_m, self.channel, self.channel >= LAYERS, cell_m, 2.0 * cell_m, 2)
-        parts = [_some(*returns, most_returns), _some(*passages, most_passages)]
+        hits = _unique_cells(self.xy_m, self.channel, self.channel < LAYERS, cell_m, cell_m, 1)
+        free = _unique_cells(self.xy_m, self.channel, self.channel >= LAYERS, cell_m, 2.0 * cell_m, 2)
+        parts = [_sample(*hits, max_hits), _sample(*free, max_free)]
         return Evidence(np.concatenate([xy for xy, _ in parts]), np.concatenate([channel for _, channel in parts]))
 
-    def some(self, most_returns: int, most_passages: int) -> Evidence:
-        """Return the evidence with at most so many returns and passages, drawn by lot, the same at each call."""
-        is_return = self.channel < LAYERS
+    def sample(self, max_hits: int, max_free: int) -> Evidence:
+        """Return at most so many hits and free cells of the evidence: random ones, the same at each call."""
+        is_hit = self.channel < LAYERS
         parts = [
-            _some(self.xy_m[which], self.channel[which], most)
-            for which, most in ((is_return, most_returns), (~is_return, most_passages))
+            _sample(self.xy_m[which], self.channel[which], most)
+            for which, most in ((is_hit, max_hits), (~is_hit, max_free))
         ]
         return Evidence(np.concatenate([xy for xy, _ in parts]), np.concatenate([channel for _, channel in parts]))
 
@@ -79,7 +81,7 @@ def evidence_of(place: Float32Array, sensor_height_m: float, sensor_xy_m: tuple[
 
 @njit(cache=True, nogil=True)
 def _seen(place: Float32Array, sensor_height: float, layers: Float32Array, half: int, cell: float) -> np.ndarray:
-    """Return (2 L, 2 half, 2 half) uint8 1 where a channel was seen; a cell with a return is no passage as well."""
+    """Return (2 L, 2 half, 2 half) uint8 1 where a channel was seen; a cell that was hit is not free."""
     count = len(layers) - 1
     cells = 2 * half
     seen = np.zeros((2 * count, cells, cells), np.uint8)
@@ -89,7 +91,7 @@ def _seen(place: Float32Array, sensor_height: float, layers: Float32Array, half:
         away = math.sqrt(x * x + y * y)
         if not (away >= 1.0 and away < 1e4 and abs(z) < 1e4):
             continue
-        # The last metre before a return is left to it: range noise, and walls that are not vertical.
+        # The last metre before a hit does not count as free: range noise, and walls that are not vertical.
         steps = min(int((away - 1.0) * inverse), 2 * half)
         du, dv, dz = x / away, y / away, (z - sensor_height) / away * cell
         height = sensor_height
@@ -107,9 +109,8 @@ def _seen(place: Float32Array, sensor_height: float, layers: Float32Array, half:
                 seen[count + layer, row, column] = 1
     for i in range(place.shape[0]):
         x, y, z = place[i, 0], place[i, 1], place[i, 2]
-        if not (abs(x) < half * cell and abs(y) < half * cell and z >= layers[0] and z < layers[count]):
-            continue
-        if x * x + y * y < 1.0:
+        inside = abs(x) < half * cell and abs(y) < half * cell and z >= layers[0] and z < layers[count]
+        if not inside or x * x + y * y < 1.0:
             continue
         layer = 0
         while z >= layers[layer + 1]:
@@ -145,7 +146,7 @@ def _key(channel: Int64Array, cells: Int64Array) -> Int64Array:
     return (channel << 40) | ((cells[:, 1] + (1 << 19)) << 20) | (cells[:, 0] + (1 << 19))
 
 
-def _some(xy_m: Float64Array, channel: Int64Array, most: int) -> tuple[Float64Array, Int64Array]:
+def _sample(xy_m: Float64Array, channel: Int64Array, most: int) -> tuple[Float64Array, Int64Array]:
     if len(channel) <= most:
         return xy_m, channel
     chosen = np.sort(np.random.default_rng(0).permutation(len(channel))[:most])

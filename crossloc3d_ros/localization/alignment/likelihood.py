@@ -1,8 +1,8 @@
 """The aerial map as what a scan is compared with: classes of 1 m cells, and log likelihood ratios in coarser ones.
 
-A coarse cell lets a return be as likely as the likeliest of its fine cells does, because a wall fills but a part of
-it; passages it averages. So the right pose loses little on the way from fine to coarse, and a search that begins on the
-coarse level rarely misses it.
+In a coarse cell a hit is as likely as in the likeliest of its fine cells, because a wall fills only a part of it; free
+space is averaged. So the right pose loses little from fine to coarse, and a search that begins on the coarse level
+rarely misses it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ Int16Array = npt.NDArray[np.int16]
 UInt16Array = npt.NDArray[np.uint16]
 
 LEVELS_M = (4.0, 2.0)
+"""Cells of the levels: the whole map in the first takes seconds, candidates in both some tens of milliseconds."""
 QUANTA = 8.0
 """Numbers of a level in one nat."""
-_MARGIN_M = REACH_M + 12.0
-_TILE_M = 256
+_MARGIN_M = REACH_M + 12.0  # around the map: evidence, a sensor beside the base, and the cells of a level
+_TILE_M = 256  # read at once: a multiple of all cells, some milliseconds each
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +42,11 @@ class Level:
 
     cell_m: float
     ratios: Int16Array
-    """(CHANNELS, H, W) in `QUANTA` a nat; a passage stands for a block of 2 x 2 cells whose lower left is this one."""
+    """(CHANNELS, H, W) in `QUANTA` a nat; free space of the 2 x 2 cells whose lower left is this one."""
 
 
 class MapLikelihood:
-    """An aerial map as far as scans were compared with it; other parts are read when they are asked for.
+    """An aerial map as far as scans were compared with it; other parts are read on demand.
 
     Row 0 is the south here, so that rows and columns grow with northing and easting.
     """
@@ -92,7 +93,7 @@ class MapLikelihood:
         return slice(first, min(max(math.ceil(high_m / _TILE_M), first + 1), count))
 
     def _fill(self, row: int, column: int) -> None:
-        """Fill one tile of all levels; the coarse ones look a cell beyond it."""
+        """Fill one tile of all levels; the coarse ones depend on a cell beyond it."""
         reach = MARGIN_CELLS + int(LEVELS_M[0])
         terrain, surface, lowest = self._heights(row - reach, column - reach, _TILE_M + 2 * reach)
         classes = surface_classes(terrain, surface, lowest)
@@ -131,7 +132,7 @@ def _extreme(raster: Raster, chosen: np.ufunc, west: float, south: float, cells:
 
 
 def coarse_ratios(log_ratios: Float32Array, classes: Int32Array, cell: int) -> Int16Array:
-    """Return (CHANNELS, H // cell, W // cell) of classes (H, W): returns by the likeliest, passages of 2 x 2 cells."""
+    """Return (CHANNELS, H // cell, W // cell) of classes (H, W): hits by the likeliest, free space of 2 x 2 cells."""
     rows, columns = classes.shape[0] // cell, classes.shape[1] // cell
     blocks = classes[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
     out = np.empty((CHANNELS, rows, columns), np.float32)

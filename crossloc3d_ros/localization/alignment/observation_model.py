@@ -1,15 +1,15 @@
-"""How likely a beam is to be returned from a cell, given what an airborne survey shows there.
+"""How likely a beam hits something in a cell, given what an airborne survey shows there.
 
-The air sees roofs and crowns, the ground walls, trunks and hedges; what they share is learned, not guessed. Each cell
+Airborne surveys see roofs and crowns, robots walls, trunks and hedges; what they have in common is learned. Each cell
 of the aerial map has a class: how high its surface lies above the terrain, how low and how high the surface around it
-gets, and how far it is to the next pulse that got through to the ground, as they do between leaves and beside a wall
-but in no house. For each class and each layer of height, places of known pose tell how often a beam that came there
-was returned. With p that share and q the share over all cells, a return speaks for a place by log(p / q), a passage by
-log((1 - p) / (1 - q)): the log likelihood ratio between "the scan was taken here" and "somewhere".
+gets, and how far it is to the next pulse that reached the ground, as pulses do between leaves and beside a wall but in
+no house. For each class and each layer of height, scans of known pose give the probability p that a beam which enters
+a cell hits something there. With q the same over all cells, the log likelihood ratio between "the scan was taken here"
+and "somewhere" is log(p / q) for a hit and log((1 - p) / (1 - q)) for free space.
 
-Inside of a house both are as rare, since the beams that would come there end at its walls. So cells beside which no
-pulse got through count by how often beams come there at all, at true poses and at others: log(v / w), with v and w the
-shares of the class among all cells seen. This is what refutes a pose from which the robot would look through houses.
+Inside of a house both are equally rare, since the beams that would enter it end at its walls. So cells without a pulse
+to the ground beside them also count by how often beams enter them at all, at true poses and at others: log(v / w), with
+v and w the shares of the class among all cells seen. This refutes poses whose beams would pass through houses.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ _HOLE_M = 20  # half the width of the widest hole in a survey that is taken for 
 HOLE = _CLOSEDNESS * _STEPS**3
 """Class of a cell without an echo in the midst of those that have one: mostly water, which mirrors pulses away."""
 UNKNOWN = HOLE + 1
-"""Class of a cell of which the survey says nothing."""
+"""Class of a cell that was not surveyed."""
 CLASSES = UNKNOWN + 1
 OPEN_GROUND = 0
 """Class of a cell where all is low and pulses reach the ground."""
 MARGIN_CELLS = 2 * _HOLE_M + 4
 """So far beyond its edges a raster must be known for the classes inside to be right."""
-_PRIOR = 50.0  # observations that a class starts with
-_STEEPEST = 3.0  # no single cell says more; the search's 16 bit numbers rest on it
-_REFUTES = 1.0  # nor does it refute more: a house may have gone since the survey, and hundreds of its cells with it
+_PRIOR = 50.0  # pseudo-observations that a class starts with
+_MAX_LOG_RATIO = 3.0  # of one cell; the 16 bit sums of the search rely on it
+_MAX_REFUTATION = 1.0  # of a closed cell: a house may have gone since the survey, and hundreds of its cells with it
 _CLOSED = 2  # from this step on a cell is inside of something
 
 
@@ -58,8 +58,8 @@ class ObservationModel:
     log_ratios: Float32Array
     """(CHANNELS, CLASSES)"""
     search_ratios: Float32Array
-    """(CHANNELS, CLASSES) the same without what refutes, which coarse cells would tell of poses beside the right one:
-    where to look more closely."""
+    """(CHANNELS, CLASSES) the same without refutation, which in coarse cells would hold for the right pose too: for the
+    coarse search."""
     expected: Float64Array
     """(CHANNELS,) mean log ratio of a cell of each channel at the true pose."""
     expected_share: float = 0.5
@@ -94,8 +94,8 @@ def _load(path: Path) -> ObservationModel:
             settings = json.loads(file.metadata()["calibration"])
         if ratios.shape != (CHANNELS, CLASSES) or gentle.shape != ratios.shape or expected.shape != (CHANNELS,):
             raise ValueError(f"log ratios of shape {ratios.shape}")
-        if not (np.abs([ratios, gentle]) <= _STEEPEST).all() or not np.isfinite(expected).all():
-            raise ValueError(f"log ratios that are not finite, or beyond {_STEEPEST:g}")
+        if not (np.abs([ratios, gentle]) <= _MAX_LOG_RATIO).all() or not np.isfinite(expected).all():
+            raise ValueError(f"log ratios that are not finite, or beyond {_MAX_LOG_RATIO:g}")
         if not (float(settings["temperature"]) > 0.0 and math.isfinite(float(settings["expected_share"]))):
             raise ValueError(f"calibration {settings}")
         return ObservationModel(
@@ -148,13 +148,13 @@ def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32
     """Return log ratios and search ratios (CHANNELS, CLASSES), and what to expect at true poses (CHANNELS,).
 
     `here` and `elsewhere` (CHANNELS, CLASSES) count the cells of each channel that fell on each class at true poses,
-    and at others. A layer from which all beams were returned, or none, tells nothing but where beams came; a class
-    that was hardly met little.
+    and at others. A layer in which all cells were hit, or none, counts only by where beams came; a class that was
+    hardly ever seen counts little.
     """
-    returns, passages = here[:LAYERS], here[LAYERS:]
-    seen, others = returns + passages, elsewhere[:LAYERS] + elsewhere[LAYERS:]
-    share = returns.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1e-9)
-    p = (returns + _PRIOR * share) / (seen + _PRIOR)
+    hits, free = here[:LAYERS], here[LAYERS:]
+    seen, others = hits + free, elsewhere[:LAYERS] + elsewhere[LAYERS:]
+    share = hits.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1e-9)
+    p = (hits + _PRIOR * share) / (seen + _PRIOR)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = np.concatenate([np.log(p / share), np.log((1.0 - p) / (1.0 - share))])
     ratios[np.tile((share <= 0.0) | (share >= 1.0), (2, 1))[:, 0]] = 0.0
@@ -162,10 +162,10 @@ def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32
     prior = _PRIOR / np.maximum(seen.sum(axis=1, keepdims=True), _PRIOR)
     closed = np.zeros(CLASSES, np.bool_)
     closed[:HOLE] = np.arange(HOLE) % _CLOSEDNESS >= _CLOSED
-    refuting = np.where(closed, np.clip(np.log((v + prior) / (w + prior)), -_REFUTES, 0.0), 0.0)
+    refuting = np.where(closed, np.clip(np.log((v + prior) / (w + prior)), -_MAX_REFUTATION, 0.0), 0.0)
     full = ratios + np.tile(refuting, (2, 1))
     for values in (ratios, full):
         values[:, UNKNOWN] = 0.0
-        np.clip(values, -_STEEPEST, _STEEPEST, out=values)
+        np.clip(values, -_MAX_LOG_RATIO, _MAX_LOG_RATIO, out=values)
     expected = (here * full).sum(axis=1) / np.maximum(here.sum(axis=1), 1.0)
     return full.astype(np.float32), ratios.astype(np.float32), expected

@@ -1,27 +1,30 @@
 """Where in the map, and in which heading, the evidence of a scan fits: exhaustive on coarse cells, then finer.
 
-The score of a pose is the sum of the log likelihood ratios of all the evidence laid into the map at that pose. On a
-coarse level it is taken for every cell of the area and every heading, row by row, so that one addition serves many
-poses at once; what scores best is looked at again on the next level, and at last at will in fine cells.
+The score of a pose is the sum of the log likelihood ratios of all the evidence, placed on the map at that pose. On a
+coarse level it is computed for every cell of the area and every heading, row by row, so that one addition serves many
+poses at once; the best are refined on the next level, and at last by hill climbing in fine cells.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.localization.alignment.evidence import CELL_M, LAYERS, Evidence
 from crossloc3d_ros.localization.alignment.likelihood import QUANTA, Int16Array, Level, MapLikelihood, UInt16Array
+from crossloc3d_ros.localization.alignment.thread_pool import SERIAL, ThreadPool
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
+# Of the climb, metres and radians: from half a cell of the finest level down to the error of the map.
 _STEPS = ((1.0, math.radians(2.0)), (0.5, math.radians(1.0)), (0.25, math.radians(0.5)), (0.12, math.radians(0.25)))
-_MOVES = 6  # at most so many moves on each step of the climb
+_MOVES = 6  # at most so many moves of each size: together they reach farther than a cell of that level
+_CONSIDERED = 400  # times as many cells as peaks are compared in full: neighbours of a peak score nearly as high
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +38,19 @@ class Peaks:
 
 
 def search_cells(
-    evidence: Evidence, level: Level, runs: Int64Array, headings: int, most: int, apart_m: float, threads: int = 1
+    evidence: Evidence,
+    level: Level,
+    runs: Int64Array,
+    headings: int,
+    most: int,
+    apart_m: float,
+    pool: ThreadPool = SERIAL,
 ) -> Peaks:
     """Return the best poses with the base in one of the cells of a level that `runs` names, best first.
 
     They are at least `apart_m` apart. `runs` (R, 3): row, first column and length of stretches of cells, as `around`
     and `inside` give them; so far from the edge of the level that the evidence stays inside. `evidence` is in cells of
-    the level, its passages in blocks of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
+    the level, its free space in blocks of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
     """
     if not len(runs) or not len(evidence):
         return Peaks(np.empty((0, 3)), np.empty(0))
@@ -53,30 +62,25 @@ def search_cells(
         return best, which[heading].astype(np.int16)
 
     # In order, so that the first of several best headings is taken, by however many threads.
-    parts = np.array_split(np.arange(headings), min(threads, headings))
-    if len(parts) == 1:
-        results = [part(parts[0])]
-    else:
-        with ThreadPoolExecutor(len(parts)) as pool:
-            results = list(pool.map(part, parts))
+    results = pool.map(part, np.array_split(np.arange(headings), min(pool.threads, headings)))
     best, heading = results[0]
     for other, its_heading in results[1:]:
         better = other > best
         best, heading = np.where(better, other, best), np.where(better, its_heading, heading)
     rows = np.repeat(runs[:, 0], runs[:, 2])
     columns = np.concatenate([np.arange(start, start + count) for start, count in runs[:, 1:]])
-    ways = np.column_stack([columns + 0.5, rows + 0.5]) * level.cell_m
-    chosen = _apart(ways, best.astype(np.float64), most, apart_m)
-    poses = np.column_stack([ways[chosen], angles[heading[chosen]]])
+    middles = np.column_stack([columns + 0.5, rows + 0.5]) * level.cell_m
+    chosen = _apart(middles, best.astype(np.float64), most, apart_m)
+    poses = np.column_stack([middles[chosen], angles[heading[chosen]]])
     return Peaks(poses, best[chosen] / QUANTA)
 
 
 def climb(
-    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, *, reach_m: float, threads: int = 1
+    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, *, reach_m: float, pool: ThreadPool = SERIAL
 ) -> tuple[Peaks, BoolArray]:
     """Climb from each pose (p, 3) to the best one around it in the fine cells, in smaller and smaller steps.
 
-    Returns the poses in their order and whether each came to rest within `reach_m` of where it began.
+    Returns the poses in their order and whether each converged within `reach_m` of where it began.
     """
     xy, steps = np.ascontiguousarray(evidence.xy_m), np.array(_STEPS)
 
@@ -86,36 +90,52 @@ def climb(
         )
         return found
 
-    found, scores, rested = _in_parts(part, poses, threads)
-    return Peaks(found, scores), rested
+    found, scores, converged = _in_parts(part, poses, pool)
+    return Peaks(found, scores), converged
 
 
-def scores_at(evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, threads: int = 1) -> Float64Array:
+def scores_at(
+    evidence: Evidence, likelihood: MapLikelihood, poses: Float64Array, pool: ThreadPool = SERIAL
+) -> Float64Array:
     """Return the scores (p,) of poses (p, 3) in the fine cells, nats."""
     xy = np.ascontiguousarray(evidence.xy_m)
 
     def part(some: Float64Array) -> tuple[Float64Array]:
         return (_scores(likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, CELL_M),)
 
-    return np.asarray(_in_parts(part, poses, threads)[0])
+    return np.asarray(_in_parts(part, poses, pool)[0])
 
 
 def local_search(
-    evidence: Evidence, level: Level, poses: Float64Array, reach_m: float, turn_rad: float, turns: int, threads: int = 1
+    evidence: Evidence,
+    level: Level,
+    poses: Float64Array,
+    reach_m: float,
+    reach_rad: float,
+    heading_steps: int,
+    pool: ThreadPool = SERIAL,
 ) -> Peaks:
-    """Return the best pose within `reach_m` and `turn_rad` of each pose (p, 3), on the grid of a level, in their order.
+    """Return the best pose within `reach_m` and `reach_rad` of each pose (p, 3), on the grid of a level, in order.
 
-    `turns` steps of the heading to either side.
+    `heading_steps`: headings that are tried to either side.
     """
     xy, reach = np.ascontiguousarray(evidence.xy_m), round(reach_m / level.cell_m)
 
     def part(some: Float64Array) -> tuple[Float64Array, Float64Array]:
         found: tuple[Float64Array, Float64Array] = _local(
-            level.ratios, xy, evidence.channel, level.cell_m, some, reach, turn_rad / max(turns, 1), turns, LAYERS
+            level.ratios,
+            xy,
+            evidence.channel,
+            level.cell_m,
+            some,
+            reach,
+            reach_rad / max(heading_steps, 1),
+            heading_steps,
+            LAYERS,
         )
         return found
 
-    found, scores = _in_parts(part, poses, threads)
+    found, scores = _in_parts(part, poses, pool)
     return Peaks(found, scores / QUANTA)
 
 
@@ -132,13 +152,7 @@ def merge(peaks: Peaks, apart_m: float, apart_rad: float) -> Int64Array:
 def are_near(poses: Float64Array, apart_m: float, apart_rad: float) -> BoolArray:
     """Mark the pairs (n, n) of poses (n, 3) that are nearer to each other than both bounds."""
     off = poses[:, None] - poses[None]
-    turned = np.abs((off[..., 2] + math.pi) % (2.0 * math.pi) - math.pi)
-    return np.asarray((np.hypot(off[..., 0], off[..., 1]) < apart_m) & (turned < apart_rad))
-
-
-def wrapped(angle: float) -> float:
-    """Return an angle in (-pi, pi]."""
-    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+    return np.asarray((np.hypot(off[..., 0], off[..., 1]) < apart_m) & (np.abs(wrap(off[..., 2])) < apart_rad))
 
 
 def around(likelihood: MapLikelihood, level: Level, places: Float64Array, radius_m: float) -> Int64Array:
@@ -180,33 +194,32 @@ def inside(likelihood: MapLikelihood, level: Level) -> Int64Array:
     return np.column_stack([along, np.full(len(along), across[0]), np.full(len(along), len(across))])
 
 
-def _in_parts(work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, threads: int) -> tuple[Any, ...]:
-    """Return what `work` gives for poses (p, 3), done by some threads: arrays of p rows."""
+def _in_parts(
+    work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, pool: ThreadPool
+) -> tuple[Any, ...]:
+    """Return what `work` gives for poses (p, 3), divided among the threads: arrays of p rows."""
     poses = np.ascontiguousarray(poses, np.float64)
-    parts = np.array_split(poses, max(min(threads, len(poses)), 1))
-    if len(parts) == 1:
-        return work(poses)
-    with ThreadPoolExecutor(len(parts)) as pool:
-        return tuple(np.concatenate(results) for results in zip(*pool.map(work, parts), strict=True))
+    parts = np.array_split(poses, max(min(pool.threads, len(poses)), 1))
+    return tuple(np.concatenate(results) for results in zip(*pool.map(work, parts), strict=True))
 
 
-def _apart(ways: Float64Array, scores: Float64Array, most: int, apart_m: float) -> Int64Array:
-    """Return the best of the ways (n, 2), greedily, each `apart_m` from those before."""
-    candidates = min(len(scores), 400 * most)
+def _apart(middles: Float64Array, scores: Float64Array, most: int, apart_m: float) -> Int64Array:
+    """Return the best of the cells' middles (n, 2), greedily, each `apart_m` from those before."""
+    candidates = min(len(scores), _CONSIDERED * most)
     order = np.argpartition(-scores, candidates - 1)[:candidates]
     order = order[np.argsort(-scores[order], kind="stable")]
-    chosen: Int64Array = _greedy(np.ascontiguousarray(ways[order]), most, apart_m)
+    chosen: Int64Array = _greedy(np.ascontiguousarray(middles[order]), most, apart_m)
     return order[chosen]
 
 
 @njit(cache=True, nogil=True)
-def _greedy(ways: Float64Array, most: int, apart_m: float) -> Int64Array:
+def _greedy(middles: Float64Array, most: int, apart_m: float) -> Int64Array:
     chosen = np.empty(most, np.int64)
     count = 0
-    for i in range(len(ways)):
+    for i in range(len(middles)):
         free = True
         for j in range(count):
-            dx, dy = ways[i, 0] - ways[chosen[j], 0], ways[i, 1] - ways[chosen[j], 1]
+            dx, dy = middles[i, 0] - middles[chosen[j], 0], middles[i, 1] - middles[chosen[j], 1]
             if dx * dx + dy * dy < apart_m * apart_m:
                 free = False
                 break
@@ -226,8 +239,7 @@ def _correlate(  # type: ignore[no-untyped-def]
     """Return the best score and its heading's number for every cell of the runs, one after the other."""
     _, rows, columns = ratios.shape
     flat = ratios.reshape(-1)
-    total = 0
-    widest = 0
+    total, widest = 0, 0
     for k in range(len(runs)):
         total += runs[k, 2]
         widest = max(widest, runs[k, 2])
@@ -239,7 +251,7 @@ def _correlate(  # type: ignore[no-untyped-def]
         c, s = math.cos(angles[h]), math.sin(angles[h])
         for e in range(len(channel)):
             u, v = (c * xy[e, 0] - s * xy[e, 1]) / cell, (s * xy[e, 0] + c * xy[e, 1]) / cell
-            # From the middle of the base's cell; a block of passages is named by its lower left cell.
+            # From the middle of the base's cell; a block of free space is named by its lower left cell.
             middle = 0.5 if channel[e] < layers else 0.0
             column, row = math.floor(u + middle), math.floor(v + middle)
             offsets[e] = (channel[e] * rows + row) * columns + column
@@ -265,7 +277,7 @@ def _correlate(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _local(  # type: ignore[no-untyped-def]
     ratios: Int16Array, xy: Float64Array, channel: Int64Array, cell: float, poses: Float64Array, reach: int,
-    turn: float, turns: int, layers: int,
+    heading_step: float, heading_steps: int, layers: int,
 ):  # fmt: skip
     _, rows, columns = ratios.shape
     found = poses.copy()
@@ -274,8 +286,8 @@ def _local(  # type: ignore[no-untyped-def]
     sums = np.empty((side, side), np.int32)
     for p in range(len(poses)):
         best = -(1 << 30)
-        for t in range(-turns, turns + 1):
-            angle = poses[p, 2] + t * turn
+        for t in range(-heading_steps, heading_steps + 1):
+            angle = poses[p, 2] + t * heading_step
             c, s = math.cos(angle), math.sin(angle)
             sums[:] = 0
             for e in range(len(channel)):
@@ -332,7 +344,7 @@ def _climb(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     found = poses.copy()
     scores = np.empty(len(poses))
-    rested = np.ones(len(poses), np.bool_)
+    converged = np.ones(len(poses), np.bool_)
     for p in range(len(poses)):
         x, y, angle = poses[p, 0], poses[p, 1], poses[p, 2]
         best = _score(classes, log_ratios, xy, channel, x, y, angle, cell)
@@ -351,5 +363,5 @@ def _climb(  # type: ignore[no-untyped-def]
                 x, y, angle = bx, by, ba
         found[p, 0], found[p, 1], found[p, 2] = x, y, angle
         scores[p] = best
-        rested[p] = math.hypot(x - poses[p, 0], y - poses[p, 1]) <= reach
-    return found, scores, rested
+        converged[p] = math.hypot(x - poses[p, 0], y - poses[p, 1]) <= reach
+    return found, scores, converged

@@ -1,4 +1,4 @@
-"""Which way is up, from an accelerometer."""
+"""The direction of gravity, from an accelerometer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crossloc3d_ros.types import Float64Array
 PLAUSIBLE_MPS2 = (5.0, 15.0)
 """An accelerometer at rest shows 9.8; what lies outside is a shock, another unit or a broken sensor."""
 STALE_NS = 1_000_000_000
-"""An average that has seen nothing for so long says nothing about the present."""
+"""A mean without samples for so long is no longer valid: the robot may have tilted."""
 
 
 def is_gravity(acceleration: Float64Array) -> bool:
@@ -46,7 +46,7 @@ class GravityFilter:
         return True
 
     def up(self, stamp_ns: int) -> Float64Array | None:
-        """Return the unit vector (3,) that points up in the base frame; None where no recent sample tells it."""
+        """Return the unit vector (3,) that points up in the base frame; None without a recent sample."""
         if self._mean is None or abs(stamp_ns - self._stamp_ns) > STALE_NS:
             return None
         return np.asarray(self._mean / np.linalg.norm(self._mean))

@@ -12,15 +12,17 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.config import FusionConfig
 from crossloc3d_ros.errors import ConfigError
 from crossloc3d_ros.types import Float32Array, Float64Array
 
-_KEPT_NS = 120_000_000_000
+_KEPT_NS = 120_000_000_000  # no scan is localized later than that after it was taken
 _TRANSFORMS = 2000  # ten seconds at 200 Hz, far more than a scan takes
 _SCAN_GAP_S = 1.5  # scans farther apart than this share too little to be aligned with each other while driving
-_LEAST_POINTS = 100
+_LEAST_POINTS = 100  # of fewer, KISS-ICP aligns noise
 _STAND_STILL_M = 0.01  # one sigma of a motion's position and, in radians, a tenth of it of its heading: never 0
+_JITTER_S, _JITTER_M = 0.05, 0.05  # by which stamps and poses of a robot at top speed may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +34,34 @@ class Motion:
     covariance: Float64Array
     """(3, 3) of the same: m2, m rad, rad2."""
     is_known: bool = True
-    """False: no odometry tells this stretch."""
+    """False: the odometry reports nothing, or nothing plausible, of this time."""
     reason: str = ""
     """One sentence for people: why it is unknown."""
 
+    @property
+    def distance_m(self) -> float:
+        """Distance between the two positions, metres."""
+        return float(np.hypot(*self.delta[:2]))
+
 
 def unknown_motion(reason: str) -> Motion:
-    """Return the motion of a stretch that no odometry tells."""
+    """Return the motion of a time of which no odometry reports."""
     return Motion(np.zeros(3), np.zeros((3, 3)), is_known=False, reason=reason)
+
+
+def plausible_motion(motion: Motion | None, elapsed_s: float, config: FusionConfig) -> Motion:
+    """Return the motion, as unknown where it is missing, not finite or faster than the robot."""
+    if motion is None:
+        return unknown_motion("there is no odometry")
+    if not motion.is_known:
+        return motion
+    if not (np.isfinite(motion.delta).all() and np.isfinite(motion.covariance).all()):
+        return unknown_motion("the odometry is not a number")
+    if motion.distance_m > config.max_speed_mps * (elapsed_s + _JITTER_S) + _JITTER_M:
+        return unknown_motion(
+            f"the odometry reports {motion.distance_m:.3g} m in {elapsed_s:.2g} s, faster than the robot"
+        )
+    return motion
 
 
 class OdometryBuffer:
@@ -113,11 +135,11 @@ class OdometryBuffer:
         if reason:
             return unknown_motion(reason)
         first, last = bisect.bisect_right(stamps, from_ns), bisect.bisect_left(stamps, to_ns)
-        way = np.array([self._at(from_ns), *poses[first:last], self._at(to_ns)])
-        steps = np.diff(way, axis=0)
-        turns = _wrap(steps[:, 2])
-        heading = way[0, 2]
-        east, north = way[-1, :2] - way[0, :2]
+        path = np.array([self._at(from_ns), *poses[first:last], self._at(to_ns)])
+        steps = np.diff(path, axis=0)
+        turns = wrap(steps[:, 2])
+        heading = path[0, 2]
+        east, north = path[-1, :2] - path[0, :2]
         cosine, sine = math.cos(heading), math.sin(heading)
         delta = np.array([cosine * east + sine * north, -sine * east + cosine * north, turns.sum()])
         length_m, turned_rad = float(np.hypot(steps[:, 0], steps[:, 1]).sum()), float(np.abs(turns).sum())
@@ -160,7 +182,7 @@ class OdometryBuffer:
             return f"the odometry begins {(stamps[0] - from_ns) * 1e-9:.2g} s after the last scan"
         if to_ns > stamps[-1] + gap_ns:
             return self._refused or f"the odometry has stopped {(to_ns - stamps[-1]) * 1e-9:.2g} s before the scan"
-        # Every step that the stretch touches, from the sample at or before its begin to the one at or after its end.
+        # Every step that the time touches, from the sample at or before its begin to the one at or after its end.
         begin = bisect.bisect_right(stamps, from_ns) - 1
         end = min(bisect.bisect_left(stamps, to_ns), len(stamps) - 1)
         steps = np.diff(stamps[begin : end + 1])
@@ -180,7 +202,7 @@ class OdometryBuffer:
             after -= 1
         (x0, y0, heading0), (x1, y1, heading1) = poses[after - 1], poses[after]
         share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        turn = float(_wrap(heading1 - heading0))
+        turn = float(wrap(heading1 - heading0))
         return x0 + share * (x1 - x0), y0 + share * (y1 - y0), heading0 + share * turn
 
 
@@ -240,7 +262,7 @@ def _impossible(
     # A burst of samples with the jitter of its stamps is no jump: a hundredth of a second is granted.
     elapsed_s = (end_ns - begin_ns) * 1e-9 + 0.01
     moved_m = math.hypot(end[0] - begin[0], end[1] - begin[1])
-    turned_deg = abs(math.degrees(_wrap(end[2] - begin[2])))
+    turned_deg = abs(math.degrees(wrap(end[2] - begin[2])))
     if moved_m > config.max_speed_mps * elapsed_s + 0.05:
         return f"the odometry jumps by {moved_m:.2g} m in {elapsed_s:.2g} s"
     if turned_deg > config.max_turn_deg_per_s * elapsed_s + 1.0:
@@ -249,7 +271,7 @@ def _impossible(
 
 
 def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) -> Float64Array:
-    """Return the covariance (3, 3) of a motion along a way of `length_m` with turns of `turned_rad` in all."""
+    """Return the covariance (3, 3) of a motion over a distance of `length_m` with turns of `turned_rad` in all."""
     position = (config.odometry_relative_std * length_m) ** 2 + _STAND_STILL_M**2
     drift = math.radians(config.odometry_drift_deg_per_m) * length_m
     heading = (config.odometry_relative_std * turned_rad) ** 2 + drift**2 + (0.1 * _STAND_STILL_M) ** 2
@@ -264,11 +286,6 @@ def _planar(T_odom_base: Float64Array) -> tuple[float, float, float] | None:
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or math.hypot(rotation[0, 0], rotation[1, 0]) < 0.1:
         return None
     return float(T_odom_base[0, 3]), float(T_odom_base[1, 3]), math.atan2(rotation[1, 0], rotation[0, 0])
-
-
-def _wrap(angle_rad: Any) -> Any:
-    """Return the angle, or angles, in [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def _kiss_icp(max_range_m: float) -> Any:

@@ -1,1 +1,1 @@
-"""From a patch to candidate submaps, and the place that they speak for."""
+"""From a patch to candidate submaps, and the place that is probable by them."""

@@ -1,4 +1,4 @@
-"""From a patch to the places in the aerial map that look like it."""
+"""Retrieval: from a patch to the submaps of the aerial map with the nearest descriptors."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def heading_angles(count: int) -> Float64Array:
 def encode_query(encoder: DescriptorEncoder, points: Float32Array) -> Float32Array:
     """Return the descriptors (H, D) under which the place of a patch (n, 3) may be found on the map.
 
-    One of each heading that the robot may have, where the encoder knows headings: submaps look north. One alone,
-    averaged over the encoder's turns, where it does not.
+    One for each heading of the robot, where the encoder distinguishes headings: submaps are encoded facing north.
+    Otherwise one alone, averaged over the encoder's test-time rotations.
     """
-    headings, turns = (encoder.headings, encoder.rotations) if isinstance(encoder, HeadingEncoder) else (1, 1)
-    if headings * turns == 1:
+    headings, rotations = (encoder.headings, encoder.rotations) if isinstance(encoder, HeadingEncoder) else (1, 1)
+    if headings * rotations == 1:
         return encoder.encode(points)[None]
-    count = headings if headings > 1 else turns
+    count = headings if headings > 1 else rotations
     descriptors = encoder.encode_batch([turn(points, float(angle)) for angle in heading_angles(count)])
     return descriptors if headings > 1 else descriptors.mean(axis=0, keepdims=True)
 
@@ -56,7 +56,7 @@ def search_headings(
 def retrieve(
     descriptors: Float32Array, aerial_map: AerialMap, top_k: int, calibration: CalibrationConfig
 ) -> Candidates:
-    """Return the `top_k` submaps, fewer on a small map, that look most like a query, best first.
+    """Return the `top_k` submaps, fewer on a small map, with the descriptors nearest to a query, best first.
 
     `descriptors` (H, D) are those of `encode_query`; a submap is as near as the nearest of them.
     """

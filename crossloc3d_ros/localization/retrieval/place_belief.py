@@ -1,8 +1,8 @@
-"""How far candidates can be believed: probabilities, the place they speak for, its covariance, and whether it is a fix.
+"""Probabilities of candidates, the most probable place among them, its covariance, and whether it is a fix.
 
-The belief has two parts. Whether the scan's place is in the map at all is told by the best descriptor distance
-(a logistic curve: indoors, or outside of the surveyed area, nothing lies near). Which place it is, if any, is told
-by the distances relative to each other (a softmax). Both curves are fitted by `calibrate` on scans of known places.
+The probability has two factors. That the scan's place is on the map at all is a logistic function of the smallest
+descriptor distance: indoors, or outside of the surveyed area, no descriptor is near. Which place it is, if any, is a
+softmax of the distances. Both are fitted by `calibrate` on scans of known places.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from crossloc3d_ros.types import (
     Float64Array,
 )
 
-_LEAST_DISTANCE = 1e-6  # the least that CalibrationConfig admits
+_MIN_DISTANCE = 1e-6  # the least that CalibrationConfig admits
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
-    """The one place that the candidates speak for, and how far to believe it."""
+class PlaceBelief:
+    """The most probable place, as the candidates have it."""
 
     status: FixStatus
     reason: str
     """One sentence for people."""
     probability: float
-    """Share of belief in the place; what is missing to 1 lies in other places or outside of the map."""
+    """Of the place; what is missing to 1 is that of other places and of the null hypothesis."""
     enu: Float64Array
     """(3,) metres, map frame."""
     covariance: Float64Array
@@ -57,23 +57,23 @@ def effective_calibration(config: RetrievalConfig, encoder: DescriptorEncoder) -
 
 
 def candidate_probabilities(distances: Float32Array, calibration: CalibrationConfig) -> Float64Array:
-    """Return each candidate's share of belief (k,); what is missing to 1 is the belief in none of them.
+    """Return the candidates' probabilities (k,); what is missing to 1 is that of the null hypothesis.
 
     `distances` (k,) are Euclidean distances between descriptors.
     """
     if len(distances) == 0:
         return np.empty(0)
     distances_64 = np.asarray(distances, dtype=np.float64)
-    some = expit((calibration.null_distance - distances_64.min()) / calibration.null_scale)
+    on_map = expit((calibration.null_distance - distances_64.min()) / calibration.null_scale)
     with np.errstate(invalid="ignore"):  # infinitely far from everything: no number, and so no fix
-        return np.asarray(some * softmax(-distances_64 / calibration.temperature))
+        return np.asarray(on_map * softmax(-distances_64 / calibration.temperature))
 
 
-def judge(candidates: Candidates, enu: Float64Array, config: RetrievalConfig) -> Belief:
-    """Find the place in which most of the belief lies, and say whether it is enough for a fix.
+def decide(candidates: Candidates, enu: Float64Array, config: RetrievalConfig) -> PlaceBelief:
+    """Return the most probable place, and whether its probability is enough for a fix.
 
     `enu` (k, 3) holds the candidates' positions in the map frame; k must be at least 1. The place is the group of
-    candidates within `cluster_radius_m` of one of them that holds the most belief; its position is their weighted
+    candidates within `cluster_radius_m` of one of them with the largest probability; its position is their weighted
     mean, its covariance their weighted spread on top of the floor that the size of a submap sets.
     """
     probabilities = candidates.probabilities
@@ -81,9 +81,9 @@ def judge(candidates: Candidates, enu: Float64Array, config: RetrievalConfig) ->
     probability = float(probabilities[members].sum())
     mean, covariance = _weighted_moments(enu[members], probabilities[members])
     covariance += np.diag([config.min_std_m**2, config.min_std_m**2, config.min_height_std_m**2])
-    # Written so that a belief that is not a number gives no fix.
+    # Written so that a probability that is not a number gives no fix.
     is_fix = probability >= config.min_probability
-    return Belief(
+    return PlaceBelief(
         status=FixStatus.FIX if is_fix else FixStatus.NO_FIX,
         reason=_explain(candidates, enu, members, probability, is_fix),
         probability=probability,
@@ -104,7 +104,7 @@ def calibrate(
 
     `distances[i]` (k,) are the descriptor distances of scan i's candidates, `separations_m[i]` (k,) how far the
     candidates lie from where the scan was taken: infinite for scans from outside of the map, which belong in here
-    so that the answer 'nowhere' is learned. A candidate is right within `radius_m`.
+    so that the null hypothesis is learned. A candidate is right within `radius_m`.
     """
     width = max(len(row) for row in distances)
     # Rows of fewer candidates are filled up with some that are infinitely far and wrong.
@@ -129,13 +129,13 @@ def calibrate(
 
     presence = minimize(presence_loss, [initial.null_distance, np.log(initial.null_scale)], method="Nelder-Mead").x
     choice = minimize(choice_loss, [np.log(initial.temperature)], method="Nelder-Mead").x
-    # Where the scans on the map look no more familiar than those outside, the best threshold may lie below zero.
-    null_distance = max(float(presence[0]), _LEAST_DISTANCE)
+    # Where scans on the map are no nearer to submaps than those outside, the best threshold may lie below zero.
+    null_distance = max(float(presence[0]), _MIN_DISTANCE)
     return CalibrationConfig(float(np.exp(choice[0])), null_distance, float(np.exp(presence[1])))
 
 
 def _heaviest_group(enu: Float64Array, probabilities: Float64Array, radius_m: float) -> BoolArray:
-    """Mark the candidates (k,) within `radius_m` of the one around which most of the belief lies."""
+    """Mark the candidates (k,) within `radius_m` of the one around which they are most probable."""
     offsets = enu[:, None, :2] - enu[None, :, :2]
     near = np.hypot(offsets[..., 0], offsets[..., 1]) <= radius_m
     group: BoolArray = near[np.argmax(near @ probabilities)]
@@ -155,13 +155,14 @@ def _weighted_moments(points: Float64Array, weights: Float64Array) -> tuple[Floa
 def _explain(candidates: Candidates, enu: Float64Array, members: BoolArray, probability: float, is_fix: bool) -> str:
     count, agreeing = len(candidates), int(members.sum())
     if is_fix:
-        return f"{agreeing} of {count} candidates lie at one place, believed {probability:.0%}"
-    nowhere = 1.0 - float(candidates.probabilities.sum())
+        return f"{agreeing} of {count} candidates lie at one place, probability {probability:.0%}"
+    null = 1.0 - float(candidates.probabilities.sum())
     best = float(candidates.descriptor_distances[0])
-    if not probability >= nowhere or agreeing == count:
-        return f"nothing in the map looks like the scan: nearest descriptor at {best:.3g}, believed {1 - nowhere:.0%}"
+    if not probability >= null or agreeing == count:
+        on_map = f"probability {1 - null:.0%} of being on the map"
+        return f"no submap resembles the scan: least descriptor distance {best:.3g}, {on_map}"
     others = np.flatnonzero(~members)
     rival = others[np.argmax(candidates.probabilities[others])]
     leader = np.flatnonzero(members)[np.argmax(candidates.probabilities[members])]
     apart = float(np.hypot(*(enu[leader] - enu[rival])[:2]))
-    return f"best candidates lie {apart:.0f} m apart: the likeliest place is believed {probability:.0%} only"
+    return f"best candidates lie {apart:.0f} m apart: the likeliest place has a probability of {probability:.0%} only"

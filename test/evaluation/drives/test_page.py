@@ -25,7 +25,7 @@ from crossloc3d_ros.evaluation.drives.evaluation import Evaluation, score_table
 from crossloc3d_ros.evaluation.drives.track_scores import score_track
 from crossloc3d_ros.pages import backdrop, charts
 from crossloc3d_ros.pages.wording import degrees, metres, percent
-from crossloc3d_ros.types import EXHAUSTIVE, TrackState
+from crossloc3d_ros.types import WHOLE_MAP, TrackState
 
 VOID = {"meta", "input", "link", "br", "img", "hr"}
 NASTY = "</script><script>alert(1)</script> & \"quotes\" {{data}} 'x'"
@@ -147,7 +147,7 @@ def tracked(table: EstimateTable, town_map: AerialMap, seed: int = 5) -> Estimat
         heading_std_rad=np.full(scans, 0.01),
         truth_heading_rad=heading if np.isfinite(table.truth_grid).any() else np.full(scans, np.nan),
         aligned=poses(8, 20.0),
-        aligned_sources=np.tile(np.array([-1, EXHAUSTIVE, 2, 3, 4, 5, 6, -2]), (scans, 1)),
+        aligned_sources=np.tile(np.array([-1, WHOLE_MAP, 2, 3, 4, 5, 6, -2]), (scans, 1)),
         hypotheses=poses(4, 30.0),
     )
 

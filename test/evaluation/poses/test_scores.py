@@ -32,7 +32,7 @@ from crossloc3d_ros.evaluation.poses.scores import (
     quantile_interval,
     score_poses,
 )
-from crossloc3d_ros.types import EXHAUSTIVE
+from crossloc3d_ros.types import WHOLE_MAP
 
 TOWNS = 10
 ABOUT = PoseAbout(
@@ -208,7 +208,7 @@ def test_without_a_pose_near_a_candidate_the_next_candidate_s_counts() -> None:
     rows = answers(8)
     rows.candidates[:, 1] = rows.candidates[:, 0]
     rows.candidates[:, 0] += 500.0
-    rows.aligned_source[:4, 0] = EXHAUSTIVE
+    rows.aligned_source[:4, 0] = WHOLE_MAP
     assert score_poses(rows, ABOUT).stages[1].within == 1.0
     rows.aligned_source[4:, 0] = -1  # what a hypothesis has brought is not retrieval's
     assert score_poses(rows, ABOUT).stages[1].within == 0.5

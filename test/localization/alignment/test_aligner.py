@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import gc
 import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,12 +15,13 @@ import numpy.typing as npt
 import pytest
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
+from crossloc3d_ros.localization.alignment import aligner as alignment
 from crossloc3d_ros.localization.alignment.aligner import Aligner, fine_counts
-from crossloc3d_ros.localization.alignment.pose_search import wrapped
 from crossloc3d_ros.types import (
-    EXHAUSTIVE,
+    WHOLE_MAP,
     AlignedPoses,
     Candidates,
     Hypotheses,
@@ -45,7 +49,7 @@ def hypotheses(*poses: tuple[float, float, float]) -> Hypotheses:
 
 
 def errors(found: AlignedPoses, x: float, y: float, heading: float) -> tuple[npt.NDArray[np.float64], float]:
-    return found.grid[0, :2] - [WEST + x, SOUTH + y], wrapped(float(found.heading_rad[0]) - heading)
+    return found.grid[0, :2] - [WEST + x, SOUTH + y], wrap(float(found.heading_rad[0]) - heading)
 
 
 def check(found: AlignedPoses) -> None:
@@ -83,9 +87,9 @@ def scan(box_town: Any, place: tuple[float, float, float]) -> PreparedScan:
 
 
 def test_poses_are_found_without_bias_in_every_heading(aligner: Aligner, box_town: Any) -> None:
-    rng, rows, rested = np.random.default_rng(0), [], 0
+    rng, rows, converged = np.random.default_rng(0), [], 0
     for i in range(64):
-        (x, y), heading = box_town.street(rng), wrapped(2 * math.pi * (i + rng.uniform(0, 1)) / 64)
+        (x, y), heading = box_town.street(rng), wrap(2 * math.pi * (i + rng.uniform(0, 1)) / 64)
         near = around((x + rng.uniform(-9, 9), y + rng.uniform(-9, 9)))
         found = aligner.align(box_town.scan(x, y, heading, rng), BASE, near)
         check(found)
@@ -93,11 +97,11 @@ def test_poses_are_found_without_bias_in_every_heading(aligner: Aligner, box_tow
         assert math.hypot(east, north) < 1.0, f"{east:.2f}, {north:.2f} m off at {heading:.2f} rad"
         assert abs(turned) < math.radians(1.0)
         assert found.probabilities[0] > 0.9
-        rested += found.converged[0]
+        converged += found.converged[0]
         c, s = math.cos(heading), math.sin(heading)
         rows.append((east, north, c * east + s * north, -s * east + c * north, 10.0 * turned))
     np.testing.assert_allclose(np.mean(rows, axis=0), 0.0, atol=0.1)
-    assert rested >= 52
+    assert converged >= 52
 
 
 def test_the_pose_is_that_of_the_base_wherever_the_sensor_is_on_it(aligner: Aligner, box_town: Any) -> None:
@@ -112,15 +116,60 @@ def test_the_pose_is_that_of_the_base_wherever_the_sensor_is_on_it(aligner: Alig
 
 def test_the_whole_map_is_searched_with_the_same_result(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
     near = aligner.align(scan, BASE, around(place[:2]))
-    everywhere = aligner.align(scan, BASE, no_candidates(), everywhere=True)
+    everywhere = aligner.align(scan, BASE, no_candidates(), search_map=True)
     check(everywhere)
-    assert (everywhere.source == EXHAUSTIVE).all()
+    assert (everywhere.source == WHOLE_MAP).all()
     np.testing.assert_allclose(everywhere.grid[0], near.grid[0], atol=0.3)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(aligner, "threads", 1 if aligner.threads > 1 else 2)
-        again = aligner.align(scan, BASE, no_candidates(), everywhere=True)
-    np.testing.assert_array_equal(again.grid, everywhere.grid)
-    np.testing.assert_array_equal(again.probabilities, everywhere.probabilities)
+
+
+@pytest.fixture
+def no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a thread is started")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+
+
+def aligned_by(threads: int, box_map: AerialMap, scan: PreparedScan, place: Any) -> AlignedPoses:
+    aligner = Aligner(box_map, AlignmentConfig(), threads=threads)
+    found = aligner.align(scan, BASE, around(place[:2], (40.0, 40.0)), hypotheses(place), search_map=True)
+    assert (aligner.pool._executor is not None) == (threads > 1)
+    aligner.close()
+    return found
+
+
+@pytest.mark.usefixtures("no_threads")
+def test_with_one_thread_no_other_is_started(box_map: AerialMap, scan: PreparedScan, place: Any) -> None:
+    assert len(aligned_by(1, box_map, scan, place))
+    with pytest.raises(AssertionError, match="a thread is started"):
+        aligned_by(2, box_map, scan, place)
+
+
+def test_threads_change_no_bit(box_map: AerialMap, scan: PreparedScan, place: Any) -> None:
+    one = aligned_by(1, box_map, scan, place)
+    for threads in (2, 5):
+        other = aligned_by(threads, box_map, scan, place)
+        for field in dataclasses.fields(AlignedPoses):
+            np.testing.assert_array_equal(getattr(other, field.name), getattr(one, field.name), strict=True)
+
+
+def test_an_aligner_keeps_its_threads_and_ends_them(box_map: AerialMap, scan: PreparedScan, place: Any) -> None:
+    before = set(threading.enumerate())
+    aligner = Aligner(box_map, AlignmentConfig(), threads=3)
+    assert set(threading.enumerate()) <= before, "none before the first scan"
+    for _ in range(3):
+        aligner.align(scan, BASE, around(place[:2]))
+    assert 0 < len(set(threading.enumerate()) - before) <= 3
+    aligner.close()
+    assert set(threading.enumerate()) <= before
+    aligner.align(scan, BASE, around(place[:2]))
+    started = set(threading.enumerate()) - before
+    assert started
+    del aligner
+    gc.collect()
+    for thread in started:
+        thread.join(10.0)
+        assert not thread.is_alive(), "they end with their aligner"
 
 
 def test_every_hypothesis_gets_a_pose_of_its_own(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
@@ -129,7 +178,7 @@ def test_every_hypothesis_gets_a_pose_of_its_own(aligner: Aligner, scan: Prepare
         (x + 2.0, y - 1.0, heading + 0.05), (40.0, 40.0, 2.0), (x, y + 1.0, heading), (-900.0, 50.0, 0.0)
     )
     for sought in (around((x, y)), no_candidates()):
-        found = aligner.align(scan, BASE, sought, given, around=len(sought) > 0)
+        found = aligner.align(scan, BASE, sought, given, search_candidates=len(sought) > 0)
         check(found)
         rows = {int(source): row for row, source in enumerate(found.source) if source < 0}
         assert sorted(rows) == [-4, -3, -2, -1]
@@ -174,10 +223,10 @@ def test_places_that_are_none_do_no_harm(aligner: Aligner, scan: PreparedScan, p
     assert len(nowhere) == 0
 
 
-def test_without_anywhere_to_look_nothing_is_found(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
+def test_without_anywhere_to_search_nothing_is_found(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
     for found in (
         aligner.align(scan, BASE, no_candidates()),
-        aligner.align(scan, BASE, around(place[:2]), around=False),
+        aligner.align(scan, BASE, around(place[:2]), search_candidates=False),
         aligner.align(scan, BASE, no_candidates(), no_hypotheses()),
     ):
         assert len(found) == 0
@@ -189,15 +238,15 @@ def test_a_scan_that_saw_little_says_nothing(aligner: Aligner, scan: PreparedSca
     few = scan.place[np.argsort(scan.place[:, 0] ** 2 + scan.place[:, 1] ** 2)][:points]
     little = PreparedScan(None, ScanCounts(), "", few, few[:, 2].copy(), scan.sensor_height_m)
     given = hypotheses(place)
-    assert len(aligner.align(little, BASE, around(place[:2]), given, everywhere=True)) == 0
+    assert len(aligner.align(little, BASE, around(place[:2]), given, search_map=True)) == 0
 
 
-def test_a_scan_of_passages_alone_is_aligned_without_certainty(aligner: Aligner, place: Any) -> None:
+def test_a_scan_of_free_space_alone_is_aligned_without_certainty(aligner: Aligner, place: Any) -> None:
     """A wide empty square: there are beams, but they met nothing."""
     angle = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     ring = np.column_stack([70.0 * np.cos(angle), 70.0 * np.sin(angle), np.full(720, 0.1)]).astype(np.float32)
     square = PreparedScan(None, ScanCounts(), "", ring, ring[:, 2].copy(), 1.3)
-    found = aligner.align(square, BASE, around(place[:2]), everywhere=True)
+    found = aligner.align(square, BASE, around(place[:2]), search_map=True)
     check(found)
     assert found.probabilities.sum() < 0.5
 
@@ -209,7 +258,7 @@ def test_maps_that_lack_terrain_or_half_are_not_believed_where_nothing_is_known(
     nothing = np.full_like(terrain, np.nan)
     for name, rasters in (("terrain", (nothing, surface)), ("surface", (terrain, nothing))):
         blind = Aligner(map_of(tmp_path / name, *rasters), AlignmentConfig())
-        found = blind.align(scan, BASE, around(place[:2]), hypotheses(place), everywhere=True)
+        found = blind.align(scan, BASE, around(place[:2]), hypotheses(place), search_map=True)
         check(found)
         assert found.probabilities.sum() < 0.2, f"without {name}"
     half = surface.copy()
@@ -221,7 +270,7 @@ def test_maps_that_lack_terrain_or_half_are_not_believed_where_nothing_is_known(
             x, y = box_town.street(rng, border_m=40.0)
             if side * (x - 140.0) > 30.0:
                 break
-        found = aligner.align(box_town.scan(x, y, 1.0, rng), BASE, around((x, y)), everywhere=True)
+        found = aligner.align(box_town.scan(x, y, 1.0, rng), BASE, around((x, y)), search_map=True)
         check(found)
         right = np.hypot(*(found.grid[:, :2] - [WEST + x, SOUTH + y]).T) < 2.0
         if side < 0:
@@ -236,7 +285,7 @@ def test_a_scan_from_another_town_is_believed_nowhere(aligner: Aligner, box_town
     rng = np.random.default_rng(4)
     for _ in range(3):
         x, y = other.street(rng)
-        found = aligner.align(other.scan(x, y, rng.uniform(-3, 3), rng), BASE, no_candidates(), everywhere=True)
+        found = aligner.align(other.scan(x, y, rng.uniform(-3, 3), rng), BASE, no_candidates(), search_map=True)
         check(found)
         assert found.probabilities.sum() < 0.5
 
@@ -262,7 +311,7 @@ def test_along_a_straight_wall_less_is_known_than_across_it(
         assert abs(across[:2] @ (found.grid[0, :2] - [WEST + 140.0, SOUTH + 140.0])) < 0.5
 
 
-def test_what_the_descriptors_say_counts(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
+def test_the_descriptors_count(aligner: Aligner, scan: PreparedScan, place: Any) -> None:
     x, y, _ = place
     places = ((x, y), (x + 110.0, y))
     for_it, against_it = (
@@ -288,9 +337,16 @@ def test_small_maps_are_searched_as_a_whole_if_wanted(
     box_map: AerialMap, search: Any, limit_km2: float, everywhere: bool
 ) -> None:
     aligner = Aligner(box_map, AlignmentConfig(scope=search, map_max_km2=limit_km2))
-    assert aligner.searches_everywhere is everywhere
+    assert aligner.searches_map is everywhere
     aligner.warm_up()
     assert bool(aligner.likelihood._filled.all()) is everywhere
+
+
+def test_headings_are_wrapped_with_west_at_pi() -> None:
+    headings = alignment._headings(np.array([0.0, -0.0, math.pi, -math.pi, 7.0]))
+    np.testing.assert_allclose(headings, [0.0, 0.0, math.pi, math.pi, 7.0 - 2 * math.pi])
+    assert headings[2] == headings[3] == math.pi
+    assert not np.signbit(headings[:2]).any()
 
 
 def test_counts_are_those_that_scores_are_summed_over(scan: PreparedScan) -> None:

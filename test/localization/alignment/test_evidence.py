@@ -35,10 +35,10 @@ def layer_of(height: float) -> int | None:
     return layers[0] if layers else None
 
 
-def followed(place: Float32Array, sensor_height: float) -> Seen:
-    """Follow each beam in steps of a cell up to the last metre before its return."""
-    returns: Seen = set()
-    passages: Seen = set()
+def traced(place: Float32Array, sensor_height: float) -> Seen:
+    """Follow each beam in steps of a cell up to the last metre before its end."""
+    hits: Seen = set()
+    free: Seen = set()
     for x, y, z in place.astype(float):
         away = math.hypot(x, y)
         step = 1
@@ -47,36 +47,36 @@ def followed(place: Float32Array, sensor_height: float) -> Seen:
             layer = layer_of(sensor_height + share * (z - sensor_height))
             cell = cell_of(share * x, share * y)
             if layer is not None and max(abs(cell[0]), abs(cell[1])) < REACH_M:
-                passages.add((LAYERS + layer, *cell))
+                free.add((LAYERS + layer, *cell))
             step += 1
         layer = layer_of(z)
         if layer is not None and away >= 1.0 and max(abs(x), abs(y)) < REACH_M:
-            returns.add((layer, *cell_of(x, y)))
-    return returns | {(c, x, y) for c, x, y in passages if (c - LAYERS, x, y) not in returns}
+            hits.add((layer, *cell_of(x, y)))
+    return hits | {(c, x, y) for c, x, y in free if (c - LAYERS, x, y) not in hits}
 
 
 @pytest.mark.parametrize("sensor_height", [0.3, 1.2, 2.9])
-def test_evidence_is_what_each_beam_met_and_flew_through(sensor_height: float) -> None:
+def test_evidence_is_what_each_beam_hit_and_passed_through(sensor_height: float) -> None:
     rng = np.random.default_rng(3)
     angle, away = rng.uniform(0, 2 * np.pi, 300), rng.uniform(0.2, 99.0, 300)
     place = np.column_stack([away * np.cos(angle), away * np.sin(angle), rng.uniform(-1.0, 14.0, 300)])
     place = place.astype(np.float32)
-    found, expected = seen_by(evidence_of(place, sensor_height)), followed(place, sensor_height)
+    found, expected = seen_by(evidence_of(place, sensor_height)), traced(place, sensor_height)
     # A step that ends on the border of two cells or layers may be rounded to either.
     assert len(found ^ expected) <= 0.002 * len(expected)
     assert {c for c, _, _ in expected} == set(range(CHANNELS))
 
 
-def test_a_beam_leaves_its_last_metre_and_its_own_cell_to_the_return() -> None:
+def test_the_last_metre_and_the_cell_of_a_hit_are_not_free() -> None:
     evidence = evidence_of(np.array([[10.5, 0.5, 1.2]], np.float32), 1.2)
-    returns, passages = evidence.channel < LAYERS, evidence.channel >= LAYERS
-    assert evidence.xy_m[returns].tolist() == [[10.5, 0.5]]
-    assert evidence.channel[returns].tolist() == [0]
-    assert sorted(evidence.xy_m[passages, 0]) == [0.5 + i for i in range(9)]
-    assert set(evidence.channel[passages]) == {LAYERS}
-    wall = np.array([[10.5, 0.5, 1.2], [40.5, 0.7, 1.2]], np.float32)  # another beam flew on through the same cell
+    hits, free = evidence.channel < LAYERS, evidence.channel >= LAYERS
+    assert evidence.xy_m[hits].tolist() == [[10.5, 0.5]]
+    assert evidence.channel[hits].tolist() == [0]
+    assert sorted(evidence.xy_m[free, 0]) == [0.5 + i for i in range(9)]
+    assert set(evidence.channel[free]) == {LAYERS}
+    wall = np.array([[10.5, 0.5, 1.2], [40.5, 0.7, 1.2]], np.float32)  # another beam passes through the same cell
     both = evidence_of(wall, 1.2)
-    assert not (both.xy_m[both.channel == LAYERS] == [10.5, 0.5]).all(axis=1).any(), "a return counts, no passage"
+    assert not (both.xy_m[both.channel == LAYERS] == [10.5, 0.5]).all(axis=1).any(), "a cell that was hit is not free"
 
 
 def test_what_is_no_place_says_nothing() -> None:
@@ -85,7 +85,7 @@ def test_what_is_no_place_says_nothing() -> None:
     assert len(evidence_of(np.array(bad, np.float32), 1.2)) == 0
     assert len(evidence_of(np.empty((0, 3), np.float32), 1.2)) == 0
     below = np.array([[20.0, 0.0, 0.2], [0.0, 30.0, 60.0]], np.float32)
-    assert (evidence_of(below, 1.2).channel >= LAYERS).all(), "the ground and the sky are no returns"
+    assert (evidence_of(below, 1.2).channel >= LAYERS).all(), "the ground and the sky are no hits"
 
 
 def test_the_sensor_s_place_on_the_base_moves_the_evidence() -> None:
@@ -116,17 +116,17 @@ def test_a_turned_scan_gives_turned_evidence(box_town: Any, quarter: int) -> Non
 
 
 def coarse_by_hand(evidence: Evidence, cell_m: float) -> Seen:
-    """Collect cells of `cell_m`, and blocks of 2 x 2 of them of which half or more were flown through."""
-    returns: Seen = set()
+    """Collect cells of `cell_m`, and blocks of 2 x 2 of them of which half or more were passed through."""
+    hits: Seen = set()
     passed: dict[tuple[int, int, int], set[tuple[int, int]]] = {}
     for channel, (x, y) in zip(evidence.channel, evidence.xy_m, strict=True):
         column, row = math.floor(x / cell_m), math.floor(y / cell_m)
         if channel < LAYERS:
-            returns.add((int(channel), (column + 0.5) * cell_m, (row + 0.5) * cell_m))
+            hits.add((int(channel), (column + 0.5) * cell_m, (row + 0.5) * cell_m))
         else:
             passed.setdefault((int(channel), column // 2, row // 2), set()).add((column, row))
     blocks = {(c, (2 * u + 1) * cell_m, (2 * v + 1) * cell_m) for (c, u, v), cells in passed.items() if len(cells) >= 2}
-    return returns | blocks
+    return hits | blocks
 
 
 @pytest.mark.parametrize("cell_m", [1.0, 2.0, 4.0])
@@ -138,13 +138,13 @@ def test_coarser_evidence_is_that_of_the_blocks(box_town: Any, cell_m: float, se
 
 def test_so_many_are_drawn_as_asked_for_and_always_the_same(box_town: Any) -> None:
     evidence = evidence_of(box_town.place(130.0, 150.0, 1.0), 1.3)
-    for fewer, most in ((evidence.some(50, 70), evidence), (evidence.coarser(2.0, 50, 70), None)):
+    for fewer, most in ((evidence.sample(50, 70), evidence), (evidence.coarser(2.0, 50, 70), None)):
         assert (fewer.channel < LAYERS).sum() == 50
         assert (fewer.channel >= LAYERS).sum() == 70
         assert most is None or seen_by(fewer) <= seen_by(most)
         assert len(seen_by(fewer)) == 120, "each once"
-    again = evidence.some(50, 70)
-    np.testing.assert_array_equal(again.xy_m, evidence.some(50, 70).xy_m)
-    everything = evidence.some(10**6, 10**6)
+    again = evidence.sample(50, 70)
+    np.testing.assert_array_equal(again.xy_m, evidence.sample(50, 70).xy_m)
+    everything = evidence.sample(10**6, 10**6)
     np.testing.assert_array_equal(np.sort(everything.channel), np.sort(evidence.channel))
     np.testing.assert_array_equal(evidence.counts(), [(evidence.channel == c).sum() for c in range(CHANNELS)])

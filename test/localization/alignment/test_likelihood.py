@@ -97,7 +97,7 @@ def test_tiles_are_seamless(wide_map: AerialMap, whole: MapLikelihood) -> None:
     np.testing.assert_array_equal(whole.classes, expected)
     for level in whole.levels:
         by_hand = coarse_ratios(MODEL.search_ratios, expected, int(level.cell_m))
-        # The last row and column of passages have no neighbour to the north and east.
+        # The last row and column of free space have no neighbour to the north and east.
         np.testing.assert_array_equal(level.ratios[:, :-1, :-1], by_hand[:, :-1, :-1])
 
 
@@ -151,7 +151,7 @@ def test_off_the_map_nothing_is_known(wide_map: AerialMap, whole: MapLikelihood)
     assert (whole.classes[off] == UNKNOWN).all()
     assert (whole.classes[~off] != UNKNOWN).mean() > 0.9
     for low, high, first, last in ((west, east, easting[0], easting[-1]), (south, north, northing[0], northing[-1])):
-        assert first < low - REACH_M and last > high + REACH_M, "evidence laid at the edge stays inside"
+        assert first < low - REACH_M and last > high + REACH_M, "evidence placed at the edge stays inside"
 
 
 def test_terrain_heights_are_those_of_the_map(wide_map: AerialMap, whole: MapLikelihood) -> None:
@@ -235,12 +235,12 @@ def test_a_town_of_boxes_is_open_on_its_streets(box_map: AerialMap, box_town: An
     x, y = (v.ravel() + 0.5 for v in np.meshgrid(np.arange(3, 277), np.arange(3, 277)))
     classes = likelihood.classes[112 + 3 : 112 + 277, 112 + 3 : 112 + 277].ravel()
     high = box_town.height(x, y) > 2.5
-    low_return = shipped.search_ratios[1, classes]
-    assert low_return[high].mean() > 0.5
-    assert low_return[~high].mean() < -1.0
+    low_hit = shipped.search_ratios[1, classes]
+    assert low_hit[high].mean() > 0.5
+    assert low_hit[~high].mean() < -1.0
 
 
-def test_evidence_laid_at_the_map_s_edge_stays_inside_of_the_levels(box_map: AerialMap) -> None:
+def test_evidence_placed_at_the_map_s_edge_stays_inside_of_the_levels(box_map: AerialMap) -> None:
     """The search reads memory at offsets that nobody checks again."""
     likelihood = MapLikelihood(box_map, MODEL)
     angle = np.linspace(0, 2 * np.pi, 720, endpoint=False)

@@ -168,7 +168,7 @@ def test_known_shares_are_recovered() -> None:
 def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> None:
     here = np.zeros((CHANNELS, CLASSES))
     here[:LAYERS, 0], here[LAYERS:, 0] = 1e6, 1e6
-    here[0, 1] = 2.0  # two returns of two beams
+    here[0, 1] = 2.0  # two hits of two beams
     here[0, 4] = 1e9
     here[LAYERS, 5] = 1e9
     elsewhere = here.copy()
@@ -180,12 +180,12 @@ def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> No
     np.testing.assert_allclose(ratios[:, 6:], 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("never", ["a return", "a passage", "anything"])
+@pytest.mark.parametrize("never", ["a hit", "free space", "anything"])
 def test_a_layer_in_which_nothing_happened_says_nothing(never: str) -> None:
     here = np.random.default_rng(0).uniform(1, 100, (CHANNELS, CLASSES))
-    if never in ("a return", "anything"):
+    if never in ("a hit", "anything"):
         here[LAYERS - 1] = 0.0
-    if never in ("a passage", "anything"):
+    if never in ("free space", "anything"):
         here[CHANNELS - 1] = 0.0
     full, ratios, expected = fit_log_ratios(here, here)
     for values in (full, ratios):
@@ -219,14 +219,14 @@ def test_half_of_the_expected_score_leaves_it_open() -> None:
     np.testing.assert_allclose(found, np.array([-0.5, 0.0, 0.5]) * expected / 4.0)
 
 
-def test_the_shipped_model_knows_that_walls_return_beams() -> None:
+def test_the_shipped_model_knows_that_beams_hit_walls() -> None:
     shipped = ObservationModel.load()
     street, roof = 0, ((4 * STEPS + 4) * STEPS + 4) * 4 + 3  # all below 0.4 m; all between 5 and 10 m, and closed
     edge = ((4 * STEPS + 0) * STEPS + 4) * 4 + 1  # beside the ground
     assert np.isfinite(shipped.log_ratios).all()
     assert (shipped.log_ratios[: LAYERS - 1, edge] > 0.5).all()
     assert (shipped.log_ratios[:LAYERS, street] < 0.0).all()
-    assert (shipped.log_ratios[LAYERS : CHANNELS - 1, roof] < -0.5).all(), "beams fly through no house"
+    assert (shipped.log_ratios[LAYERS : CHANNELS - 1, roof] < -0.5).all(), "beams pass through no house"
 
 
 @pytest.mark.parametrize(

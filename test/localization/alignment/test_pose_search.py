@@ -24,8 +24,8 @@ from crossloc3d_ros.localization.alignment.pose_search import (
     merge,
     scores_at,
     search_cells,
-    wrapped,
 )
+from crossloc3d_ros.localization.alignment.thread_pool import ThreadPool
 
 SHAPE = (40, 46)
 
@@ -121,27 +121,29 @@ def test_threads_change_nothing(threads: int) -> None:
     level.ratios[:] = np.clip(level.ratios, -1, 1)  # many headings are equally good
     evidence, cells = some_evidence(2.0, 12), np.ones(SHAPE, np.bool_)
     cells[:12] = cells[-12:] = cells[:, :12] = cells[:, -12:] = False
-    one, many = (search_cells(evidence, level, runs_of(cells), 11, 50, 3.0, count) for count in (1, threads))
+    one, many = (
+        search_cells(evidence, level, runs_of(cells), 11, 50, 3.0, ThreadPool(count)) for count in (1, threads)
+    )
     np.testing.assert_array_equal(one.poses, many.poses)
     np.testing.assert_array_equal(one.scores, many.scores)
 
 
 @pytest.mark.parametrize("threads", [2, 5, 64])
 def test_threads_share_poses_and_keep_their_order(likelihood: MapLikelihood, box_town: Any, threads: int) -> None:
-    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).some(100, 100)
+    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).sample(100, 100)
     rng = np.random.default_rng(6)
     poses = np.column_stack([rng.uniform(200, 300, (23, 2)), rng.uniform(-3, 3, 23)])
-    level = likelihood.levels[1]
+    level, pools = likelihood.levels[1], (ThreadPool(1), ThreadPool(threads))
     for few in (poses, poses[:1], poses[:0]):
-        one, many = (local_search(evidence.coarser(2.0, 90, 90), level, few, 4.0, 0.1, 2, n) for n in (1, threads))
+        one, many = (local_search(evidence.coarser(2.0, 90, 90), level, few, 4.0, 0.1, 2, pool) for pool in pools)
         np.testing.assert_array_equal(one.poses, many.poses)
         np.testing.assert_array_equal(one.scores, many.scores)
-        (one, rested), (many, all_rested) = (
-            climb(evidence, likelihood, few, reach_m=3.0, threads=n) for n in (1, threads)
+        (one, converged), (many, all_converged) = (
+            climb(evidence, likelihood, few, reach_m=3.0, pool=pool) for pool in pools
         )
         np.testing.assert_array_equal(one.poses, many.poses)
-        np.testing.assert_array_equal(rested, all_rested)
-        np.testing.assert_array_equal(one.scores, scores_at(evidence, likelihood, one.poses, threads))
+        np.testing.assert_array_equal(converged, all_converged)
+        np.testing.assert_array_equal(one.scores, scores_at(evidence, likelihood, one.poses, pools[1]))
 
 
 def test_nothing_marked_and_nothing_seen_find_nothing() -> None:
@@ -153,8 +155,8 @@ def test_nothing_marked_and_nothing_seen_find_nothing() -> None:
 
 
 def test_sums_of_coarse_ratios_fit_into_16_bits() -> None:
-    returns = alignment.COARSE_RETURNS * math.ceil(QUANTA * observation_model._STEEPEST)
-    assert returns + alignment.COARSE_PASSAGES * 100 <= np.iinfo(np.int16).max
+    hits = alignment.COARSE_HITS * math.ceil(QUANTA * observation_model._MAX_LOG_RATIO)
+    assert hits + alignment.COARSE_FREE * 100 <= np.iinfo(np.int16).max
 
 
 @pytest.mark.parametrize("cell_m", [1.0, 2.0])
@@ -193,22 +195,22 @@ def test_marked_cells_are_those_near_places_and_on_the_map(likelihood: MapLikeli
 
 
 def test_the_climb_never_descends_and_says_how_far_it_went(likelihood: MapLikelihood, box_town: Any) -> None:
-    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).some(300, 300)
+    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).sample(300, 300)
     rng = np.random.default_rng(6)
     x, y = 112.0 + 140.0, 112.0 + 120.0
     poses = np.column_stack([x + rng.uniform(-9, 9, 20), y + rng.uniform(-9, 9, 20), 0.7 + rng.uniform(-0.3, 0.3, 20)])
     before = scores_at(evidence, likelihood, poses)
-    found, rested = climb(evidence, likelihood, poses, reach_m=3.0)
+    found, converged = climb(evidence, likelihood, poses, reach_m=3.0)
     np.testing.assert_allclose(found.scores, scores_at(evidence, likelihood, found.poses), atol=1e-6)
     assert (found.scores >= before).all()
     assert (found.scores > before).any()
     moved = np.hypot(*(found.poses - poses)[:, :2].T)
-    np.testing.assert_array_equal(rested, moved <= 3.0)
-    assert rested.any() and not rested.all()
+    np.testing.assert_array_equal(converged, moved <= 3.0)
+    assert converged.any() and not converged.all()
 
 
 def test_scores_are_sums_over_the_cells_that_evidence_falls_on(likelihood: MapLikelihood, box_town: Any) -> None:
-    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).some(200, 200)
+    evidence = evidence_of(box_town.place(140.0, 120.0, 0.7), 1.3).sample(200, 200)
     rows, columns = likelihood.classes.shape
     poses = np.array(
         [[250.3, 230.9, 0.4], [5.0, 7.0, 3.0], [columns - 3.0, 40.0, -2.0], [-1e6, 0.0, 0.0], [np.nan, 9.0, 0.0]]
@@ -230,8 +232,6 @@ def test_poses_are_one_where_both_place_and_heading_are_near() -> None:
     poses = np.array([[0, 0, 3.1], [2.0, 0, -3.1], [2.0, 0, 0.0], [5.0, 0, 3.1], [0.5, 0, 3.0]], float)
     assert merge(Peaks(poses, np.array([5.0, 4.0, 3.0, 2.0, 9.0])), 3.0, 0.2).tolist() == [4, 2, 3]
     assert merge(Peaks(np.empty((0, 3)), np.empty(0)), 3.0, 0.2).tolist() == []
-    assert [wrapped(a) for a in (0.0, math.pi, -math.pi)] == [0.0, math.pi, math.pi]
-    assert wrapped(7.0) == pytest.approx(7.0 - 2 * math.pi)
 
 
 @pytest.mark.parametrize("quarter", [1, 2, 3])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from crossloc3d_ros.config import CalibrationConfig, RetrievalConfig, from_dict, to_dict
-from crossloc3d_ros.localization.retrieval.place_belief import calibrate, candidate_probabilities, judge
+from crossloc3d_ros.localization.retrieval.place_belief import calibrate, candidate_probabilities, decide
 from crossloc3d_ros.types import Candidates, FixStatus
 
 CALIBRATION = CalibrationConfig(temperature=0.1, null_distance=1.0, null_scale=0.05)
@@ -54,7 +54,7 @@ def test_half_of_the_belief_is_in_none_at_the_calibrated_distance() -> None:
 def test_candidates_around_one_place_give_a_fix_at_their_weighted_mean() -> None:
     enu = places((0, 0), (19, 0), (0, 19), (700, 0))
     candidates = candidates_of(np.array([0.30, 0.30, 0.30, 0.55]), enu)
-    belief = judge(candidates, enu, CONFIG)
+    belief = decide(candidates, enu, CONFIG)
     assert belief.status is FixStatus.FIX
     assert belief.members.tolist() == [True, True, True, False]
     np.testing.assert_allclose(belief.enu[:2], [19 / 3, 19 / 3], atol=1e-9)
@@ -63,35 +63,35 @@ def test_candidates_around_one_place_give_a_fix_at_their_weighted_mean() -> None
 
 def test_many_that_agree_outweigh_one_that_is_a_little_nearer() -> None:
     enu = places((900, 0), (0, 0), (19, 0), (38, 0))
-    belief = judge(candidates_of(np.array([0.30, 0.33, 0.33, 0.33]), enu), enu, CONFIG)
+    belief = decide(candidates_of(np.array([0.30, 0.33, 0.33, 0.33]), enu), enu, CONFIG)
     assert belief.members.tolist() == [False, True, True, True]
 
 
 def test_two_equal_places_give_no_fix_and_the_distance_between_them() -> None:
     enu = places((0, 0), (800, 0), (1600, 0))
-    belief = judge(candidates_of(np.array([0.3, 0.301, 0.301]), enu), enu, CONFIG)
+    belief = decide(candidates_of(np.array([0.3, 0.301, 0.301]), enu), enu, CONFIG)
     assert belief.status is FixStatus.NO_FIX
     assert "best candidates lie 800 m apart" in belief.reason
 
 
 def test_a_scan_from_nowhere_gives_no_fix_even_if_all_candidates_agree() -> None:
     enu = places((0, 0), (19, 0), (0, 19))
-    belief = judge(candidates_of(np.array([1.4, 1.4, 1.4]), enu), enu, CONFIG)
+    belief = decide(candidates_of(np.array([1.4, 1.4, 1.4]), enu), enu, CONFIG)
     assert belief.status is FixStatus.NO_FIX
-    assert "nothing in the map looks like the scan" in belief.reason
+    assert "no submap resembles the scan" in belief.reason
 
 
 @pytest.mark.parametrize("distance", [np.nan, np.inf, 1e30])
 def test_a_distance_that_is_no_number_gives_no_fix(distance: float) -> None:
     enu = places((0, 0), (19, 0))
-    belief = judge(candidates_of(np.array([distance, distance]), enu), enu, CONFIG)
+    belief = decide(candidates_of(np.array([distance, distance]), enu), enu, CONFIG)
     assert belief.status is FixStatus.NO_FIX
 
 
 @given(hnp.arrays(np.float64, (12, 3), elements=st.floats(-500, 500)), st.integers(0, 2**31))
 def test_the_covariance_is_never_below_the_floor_and_never_beyond_the_cluster(enu: Array, seed: int) -> None:
     distances = np.random.default_rng(seed).uniform(0.2, 0.8, 12)
-    belief = judge(candidates_of(np.sort(distances), enu), enu, CONFIG)
+    belief = decide(candidates_of(np.sort(distances), enu), enu, CONFIG)
     np.testing.assert_allclose(belief.covariance, belief.covariance.T, atol=1e-9)
     variances = np.linalg.eigvalsh(belief.covariance[:2, :2])
     assert variances.min() >= CONFIG.min_std_m**2 * (1 - 1e-9)
@@ -103,9 +103,9 @@ def test_the_order_of_equal_rows_does_not_matter() -> None:
     rng = np.random.default_rng(3)
     enu, distances = rng.uniform(-300, 300, (25, 3)), rng.uniform(0.2, 0.6, 25)
     order = np.argsort(distances)
-    one = judge(candidates_of(distances[order], enu[order]), enu[order], CONFIG)
+    one = decide(candidates_of(distances[order], enu[order]), enu[order], CONFIG)
     turned = rng.permutation(25)
-    two = judge(candidates_of(distances[turned], enu[turned]), enu[turned], CONFIG)
+    two = decide(candidates_of(distances[turned], enu[turned]), enu[turned], CONFIG)
     np.testing.assert_allclose(one.enu, two.enu, atol=1e-9)
     assert one.probability == pytest.approx(two.probability)
 
