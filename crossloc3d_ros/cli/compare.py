@@ -16,6 +16,7 @@ from crossloc3d_ros.cli import common
 from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark
+from crossloc3d_ros.pages.wording import percent
 
 if TYPE_CHECKING:
     from crossloc3d_ros.training.comparison import Comparison, Result
@@ -125,7 +126,7 @@ def _comparison(
         if progress.validation is None:
             line += f"  {progress.samples_per_second:5.1f} clouds/s"
         else:
-            line += f"  validation: R@1 {100 * progress.validation.recall('R@1', 100.0).value:.1f} % at 100 m"
+            line += f"  validation: R@1 {100 * progress.validation.recall('R@1', 100.0).share.value:.1f} % at 100 m"
         console.print(line, soft_wrap=True)
 
     return Comparison(
@@ -166,8 +167,8 @@ def _show(results: Sequence[Result], written: Sequence[Path], console: Console) 
     """Say how far the table is."""
     last = results[-1]
     console.print(
-        f"{last.name}: R@1 {100 * last.cell(1, 100.0).recall:.1f} % at 100 m, {100 * last.cell(1, 25.0).recall:.1f} % "
-        f"at 25 m; {len(results)} rows in {written[0]}",
+        f"{last.name}: R@1 {percent(last.recall(1, 100.0).share.value, 1)} at 100 m, "
+        f"{percent(last.recall(1, 25.0).share.value, 1)} at 25 m; {len(results)} rows in {written[0]}",
         soft_wrap=True,
     )
 
@@ -177,8 +178,8 @@ def _terminal_table(results: Sequence[Result]) -> Table:
     for i, name in enumerate(("", "R@1 100 m", "R@25 100 m", "R@1 25 m", "parameters", "ms, 1 thread")):
         table.add_column(name, justify="right" if i else "left")
     for result in results:
-        cells = (result.cell(1, 100.0), result.cell(25, 100.0), result.cell(1, 25.0))
-        shares = [f"{100 * cell.recall:.1f} [{100 * cell.low:.0f}–{100 * cell.high:.0f}]" for cell in cells]
+        found = (result.recall(1, 100.0).share, result.recall(25, 100.0).share, result.recall(1, 25.0).share)
+        shares = [f"{100 * share.value:.1f} [{100 * share.low:.0f}–{100 * share.high:.0f}]" for share in found]
         size = f"{result.parameters / 1e6:.2f} M" if result.parameters else "none"
         table.add_row(result.name, *shares, size, f"{result.one_thread_ms:.0f}")
     return table

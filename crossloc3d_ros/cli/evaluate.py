@@ -50,9 +50,11 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
 )
 from crossloc3d_ros.evaluation.retrieval.results import as_csv, as_json, headline
 from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
-from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, RADII_M, Scores, score
+from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, Scores, score
 from crossloc3d_ros.evaluation.retrieval.verification import verify
+from crossloc3d_ros.evaluation.statistics import RADII_M
 from crossloc3d_ros.files import write_atomically
+from crossloc3d_ros.pages.wording import percent
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import EncoderLoader
 
@@ -305,8 +307,10 @@ def pose_tables(scores: PoseScores) -> list[Table]:
         part = _table(title, ["", "scans", "2 m and 5°, %", "10 m", "50 m", "median, m"])
         for stage in stages:
             middle = f"{stage.median_m:.1f}" if math.isfinite(stage.median_m) else "–"
-            part.add_row(stage.name, f"{stage.scans:,}", _percent(stage.within), _percent(stage.within_10_m),
-                         _percent(stage.within_50_m), middle)  # fmt: skip
+            shares = (stage.within, stage.within_10_m, stage.within_50_m)
+            part.add_row(
+                stage.name, f"{stage.scans:,}", *(percent(share, 1, unit="") for share in shares), middle
+            )  # fmt: skip
         if stages:
             shown.append(part)
     return shown
@@ -392,17 +396,17 @@ def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
     """Return what the terminal shows: a table a radius, and the main scores divided by group and family."""
     shown = []
     for radius in RADII_M:
-        figures = [figure for figure in main_scores.overall.figures if figure.radius_m == radius]
+        figures = [figure for figure in main_scores.overall.recalls if figure.radius_m == radius]
         names = [f"{figure.label}*" if figure.rank == PUBLISHED_ONE_PER_CENT else figure.label for figure in figures]
         table = _table(f"Within {radius:g} m, %", ["", names[0], "95 %", "by lot", *names[1:]])
         for each in scores:
-            first, *others = (each.overall.figure(figure.label, radius) for figure in figures)
+            first, *others = (each.overall.recall(figure.label, radius) for figure in figures)
             table.add_row(
                 describe_briefly(each.about),
-                _percent(first.share.value),
+                percent(first.share.value, 1, unit=""),
                 f"{100 * first.share.low:.0f}–{100 * first.share.high:.0f}",
-                _percent(first.chance),
-                *(_percent(figure.share.value) for figure in others),
+                percent(first.chance, 1, unit=""),
+                *(percent(figure.share.value, 1, unit="") for figure in others),
             )
         shown.append(table)
     notes = ["* published as AR@1%: the released evaluators retrieve 25 answers"]
@@ -417,13 +421,9 @@ def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
     )
     families = main_scores.families if len(main_scores.families) > 1 else ()
     for group in (*families, *main_scores.groups, main_scores.overall):
-        values = [group.figure("R@1", radius) for radius in RADII_M] + [group.figure("R@25", 100.0)]
-        divided.add_row(group.name, f"{group.queries:,}", *(_percent(v.share.value) for v in values))
+        values = [group.recall("R@1", radius) for radius in RADII_M] + [group.recall("R@25", 100.0)]
+        divided.add_row(group.name, f"{group.queries:,}", *(percent(v.share.value, 1, unit="") for v in values))
     return [*shown, divided]
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f}" if math.isfinite(share) else "–"
 
 
 def _table(title: str, columns: Sequence[str]) -> Table:

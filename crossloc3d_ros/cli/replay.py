@@ -43,8 +43,9 @@ from crossloc3d_ros.evaluation.drives.evaluation import (
     write_summary,
 )
 from crossloc3d_ros.evaluation.drives.page import About, write_report
+from crossloc3d_ros.evaluation.drives.place_scores import RANKS
 from crossloc3d_ros.evaluation.drives.track_scores import LOST, TrackScores
-from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS
+from crossloc3d_ros.evaluation.statistics import INDEPENDENT_M, RADII_M
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.pages.wording import degrees, metres, percent

@@ -146,8 +146,9 @@ def _verification(arguments: argparse.Namespace) -> int:
 
     from crossloc3d_ros.encoder.checkpoint import load_encoder
     from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
+    from crossloc3d_ros.evaluation.statistics import RADII_M
     from crossloc3d_ros.training.material import read_material
-    from crossloc3d_ros.training.verification import RADII_M, fit_verification
+    from crossloc3d_ros.training.verification import fit_verification
 
     if arguments.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
@@ -209,7 +210,7 @@ def _run(arguments: argparse.Namespace) -> int:
     validation = trainer.run(resume=arguments.resume)
     trainer.write_card()
     for recall in validation.recalls:
-        share, chance = 100 * recall.value, 100 * recall.chance
+        share, chance = 100 * recall.share.value, 100 * recall.chance
         print(f"{recall.label:>5} within {recall.radius_m:3.0f} m: {share:5.1f} %  (chance {chance:.1f} %)")
     return 0
 
@@ -253,8 +254,8 @@ def _progress(console: Console) -> Any:
             near, far = progress.validation.recall("R@1", 25.0), progress.validation.recall("R@1", 100.0)
             most = progress.validation.recall("R@25", 100.0)
             console.print(
-                f"{line}  validation: R@1 {100 * far.value:.1f} % at 100 m (chance {100 * far.chance:.1f} %), "
-                f"{100 * near.value:.1f} % at 25 m; R@25 {100 * most.value:.1f} % at 100 m",
+                f"{line}  validation: R@1 {100 * far.share.value:.1f} % at 100 m (chance {100 * far.chance:.1f} %), "
+                f"{100 * near.share.value:.1f} % at 25 m; R@25 {100 * most.share.value:.1f} % at 100 m",
                 soft_wrap=True,
             )
 

@@ -6,12 +6,12 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from crossloc3d_ros.evaluation.recall import Share
+    from crossloc3d_ros.evaluation.statistics import Share
 
 UNKNOWN = "–"
 
 
-def percent(share: float, digits: int | None = None) -> str:
+def percent(share: float, digits: int | None = None, unit: str = " %") -> str:
     """Return a share as per cent, with as many decimals.
 
     By default with one where it is small, or so near to 1 that rounding would hide it.
@@ -20,12 +20,12 @@ def percent(share: float, digits: int | None = None) -> str:
         return UNKNOWN
     value = 100 * share
     if digits is not None:
-        return f"{value:.{digits}f} %"
+        return f"{value:.{digits}f}{unit}"
     if 0 < value < 0.1:
-        return f"{value:.2f} %"
+        return f"{value:.2f}{unit}"
     if value in (0, 100) or 10 <= value < 99.5:
-        return f"{value:.0f} %"
-    return f"{min(value, 99.9):.1f} %" if value > 10 else f"{value:.1f} %"
+        return f"{value:.0f}{unit}"
+    return f"{min(value, 99.9):.1f}{unit}" if value > 10 else f"{value:.1f}{unit}"
 
 
 def fine_percent(share: float) -> str:

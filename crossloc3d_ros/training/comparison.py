@@ -18,12 +18,11 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig, from_dict, to_dict, usable_threads
+from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig, to_dict, usable_threads
 from crossloc3d_ros.datasets.place_sets import EvaluationSet
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.encoder.networks import PUBLISHED, make_network
 from crossloc3d_ros.errors import ConfigError, CrossLocError, TrainingError
-from crossloc3d_ros.evaluation.recall import Share
 from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob, time_queries
 from crossloc3d_ros.evaluation.retrieval.predictions import (
     Plan,
@@ -35,6 +34,7 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
 )
 from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import difference, score
+from crossloc3d_ros.evaluation.statistics import Recall, Share, find_recall
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.training.loop import Progress, Trainer
@@ -72,18 +72,6 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One recall of one row."""
-
-    rank: int
-    radius_m: float
-    recall: float
-    low: float
-    high: float
-    chance: float
-
-
-@dataclass(frozen=True)
 class Result:
     """What a row came to."""
 
@@ -106,14 +94,14 @@ class Result:
     clouds: int
     """Clouds seen in training."""
     hours: float
-    cells: tuple[Cell, ...]
+    recalls: tuple[Recall, ...]
     ahead: Share | None = None
     """By how much its R@1 at 100 m exceeds the reference row's on the same queries; None for the reference."""
     published: tuple[float, float] | None = None
 
-    def cell(self, rank: int, radius_m: float) -> Cell:
-        """Return one recall."""
-        return next(cell for cell in self.cells if (cell.rank, cell.radius_m) == (rank, radius_m))
+    def recall(self, rank: int, radius_m: float) -> Recall:
+        """Return one recall; KeyError where there is none."""
+        return find_recall(self.recalls, f"R@{rank}", radius_m)
 
 
 def rows_of(table: TableName, base: TrainConfig) -> list[Row]:
@@ -290,7 +278,7 @@ class Comparison:
         predictions = self._predict(row, encoder, loader)
         write_predictions(folder / PREDICTIONS, predictions)
         result = self._result(row, encoder, predictions)
-        content = json.dumps({"format": _FORMAT, **to_dict(result)}, indent=1) + "\n"
+        content = json.dumps({"format": _FORMAT, **_stored(result)}, indent=1) + "\n"
         write_atomically(folder / RESULT, content, TrainingError, synced=True)
 
     def _train(self, row: Row, config: TrainConfig, folder: Path) -> None:
@@ -329,12 +317,7 @@ class Comparison:
     def _result(self, row: Row, encoder: DescriptorEncoder, predictions: Predictions) -> Result:
         about = predictions.about
         scores = score(predictions, self.evaluation_set).overall
-        cells = []
-        for radius_m in RADII_M:
-            for rank in RANKS:
-                figure = scores.figure(f"R@{rank}", radius_m)
-                share = figure.share
-                cells.append(Cell(rank, radius_m, share.value, share.low, share.high, figure.chance))
+        recalls = tuple(scores.recall(f"R@{rank}", radius_m) for radius_m in RADII_M for rank in RANKS)
         parameters, steps, clouds, hours = 0, 0, 0, 0.0
         if row.config is not None:
             parameters = sum(p.numel() for p in make_network(row.config.model).parameters())
@@ -355,7 +338,7 @@ class Comparison:
             steps=steps,
             clouds=clouds,
             hours=hours,
-            cells=tuple(cells),
+            recalls=recalls,
             published=row.published,
         )
 
@@ -379,7 +362,7 @@ class Comparison:
             content: dict[str, Any] = json.loads(path.read_text())
             if content.pop("format") != _FORMAT or content["data"] != self.evaluation_set.fingerprint():
                 return None
-            content["cells"] = tuple(from_dict(Cell, cell) for cell in content["cells"])
+            content["recalls"] = tuple(_recall(cell) for cell in content.pop("cells"))
             content["published"] = row.published
             result = Result(**{**content, "ahead": None})
             load_predictions(path.with_name(PREDICTIONS))
@@ -392,6 +375,22 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     """Write a row's predictions, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     save_predictions(path, predictions)
+
+
+def _stored(result: Result) -> dict[str, Any]:
+    """Return what a row's file holds, see `_recall`."""
+    cells = [
+        {"rank": r.rank, "radius_m": r.radius_m, "recall": r.share.value, "low": r.share.low, "high": r.share.high,
+         "chance": r.chance}
+        for r in result.recalls
+    ]  # fmt: skip
+    content = {("cells" if key == "recalls" else key): value for key, value in to_dict(result).items()}
+    return {**content, "cells": cells}
+
+
+def _recall(cell: dict[str, Any]) -> Recall:
+    rank, share = cell["rank"], Share(cell["recall"], cell["low"], cell["high"])
+    return Recall(rank, cell["radius_m"], share, cell["chance"], f"R@{rank}")
 
 
 def select(rows: Sequence[Row], slugs: Sequence[str]) -> list[Row]:

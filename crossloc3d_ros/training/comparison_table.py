@@ -48,8 +48,9 @@ def as_csv(results: Sequence[Result]) -> str:
         figures = []
         for radius in RADII_M:
             for rank in RANKS:
-                cell = result.cell(rank, radius)
-                figures += [round(value, 6) for value in (cell.recall, cell.low, cell.high, cell.chance)]
+                recall = result.recall(rank, radius)
+                share = recall.share
+                figures += [round(value, 6) for value in (share.value, share.low, share.high, recall.chance)]
         ahead = result.ahead
         writer.writerow(
             [
@@ -74,12 +75,12 @@ def as_markdown(results: Sequence[Result], texts: TableTexts) -> str:
 def as_html(results: Sequence[Result], texts: TableTexts) -> str:
     """Return the table as a page that needs nothing but itself."""
     head, *body = _cells(results)
-    best = max((result.cell(1, 100.0).recall for result in results), default=0.0)
+    best = max((result.recall(1, 100.0).share.value for result in results), default=0.0)
     style = (resources.files("crossloc3d_ros.pages") / "assets" / "page.css").read_text(encoding="utf-8")
     rows = []
     for result, cells in zip(results, body, strict=True):
-        width = 100.0 * result.cell(1, 100.0).recall
-        mark = "best" if result.cell(1, 100.0).recall == best else ""
+        width = 100.0 * result.recall(1, 100.0).share.value
+        mark = "best" if result.recall(1, 100.0).share.value == best else ""
         bar = f'<td><span class="bar" style="width:{width:.1f}px"></span></td>'
         rows.append(f'<tr class="{mark}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}{bar}</tr>')
     return (
@@ -122,8 +123,8 @@ def _cells(results: Sequence[Result]) -> list[list[str]]:
             f"{result.search_ms:.1f}",
         ]
         for rank, radius in recalls:
-            cell = result.cell(rank, radius)
-            cells.append(f"{100 * cell.recall:.1f} [{100 * cell.low:.0f}–{100 * cell.high:.0f}]")
+            share = result.recall(rank, radius).share
+            cells.append(f"{100 * share.value:.1f} [{100 * share.low:.0f}–{100 * share.high:.0f}]")
         ahead = result.ahead
         cells.append(
             ("reference" if compared else "") if ahead is None
@@ -139,8 +140,8 @@ def _cells(results: Sequence[Result]) -> list[list[str]]:
 def _notes(results: Sequence[Result]) -> list[str]:
     if not results:
         return ["No row is done yet."]
-    cells = [results[0].cell(rank, radius) for radius in RADII_M for rank in RANKS]
-    chances = ", ".join(f"R@{c.rank} {c.radius_m:.0f} m {100 * c.chance:.1f} %" for c in cells)
+    recalls = [results[0].recall(rank, radius) for radius in RADII_M for rank in RANKS]
+    chances = ", ".join(f"{r.label} {r.radius_m:.0f} m {100 * r.chance:.1f} %" for r in recalls)
     return [
         f"Recall in per cent with its 95 % interval; by lot: {chances}.",
         "Milliseconds: the median to encode one query in all the headings that the method tries, on the CPU, and to "

@@ -178,7 +178,7 @@ class Trainer:
         history = run_folder.history(self.folder)
         notes = run_folder.metadata(self.config, state.step, state.elapsed_s, validation, history)
         run_folder.export(self.folder / name, averaged, self.config, notes)
-        recall = validation.recall("R@1", 100.0).value
+        recall = validation.recall("R@1", 100.0).share.value
         if recall > state.best_recall:
             state.best_recall = recall
             run_folder.export(self.folder / run_folder.BEST, averaged, self.config, notes)
@@ -203,7 +203,7 @@ class Trainer:
         validation = validate(held_out, lambda c: encode(model, c, config.device), config.headings, config.rotations)
         log.write(
             "validation", step=state.step, elapsed_s=round(state.elapsed_s, 1),
-            seconds=round(time.monotonic() - began, 1), **asdict(validation),
+            seconds=round(time.monotonic() - began, 1), **validation.stored(),
         )  # fmt: skip
         return validation
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.evaluation.statistics import RADII_M
 from crossloc3d_ros.training.sampling import HardPlaces, Sampler
-from crossloc3d_ros.training.validation import RADII_M, euclidean_distances
+from crossloc3d_ros.training.validation import euclidean_distances
 from crossloc3d_ros.types import Float32Array
 
 _NEIGHBOURS = 8  # a place's most similar ones; a batch holds a few of them

@@ -224,14 +224,14 @@ def metadata(
         "queries": validation.queries,
         "submaps": validation.submaps,
     }
-    recalls = {f"{r.label}@{r.radius_m:.0f}m": round(r.value, 4) for r in validation.recalls}
+    recalls = {f"{r.label}@{r.radius_m:.0f}m": round(r.share.value, 4) for r in validation.recalls}
     training = {"steps": step, "hours": round(elapsed_s / 3600.0, 3), "pairs": config.pairs, "seed": config.seed}
     return {
         "credibility": stored_calibration(validation.calibration),
         "distances": json.dumps(distances),
         "validation": json.dumps(recalls),
         "training": json.dumps({**training, "loss": config.loss}),
-        "examined": json.dumps({"kind": "validation", "step": step, "elapsed_s": elapsed_s, **asdict(validation)}),
+        "examined": json.dumps({"kind": "validation", "step": step, "elapsed_s": elapsed_s, **validation.stored()}),
         "headings": str(config.headings),
         "turns": str(config.rotations),
         HISTORY: json.dumps(chain),

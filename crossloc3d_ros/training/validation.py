@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from crossloc3d_ros.clouds.patch import turn
 from crossloc3d_ros.config import CalibrationConfig
-from crossloc3d_ros.evaluation.recall import chance_of_hit, wilson_share
+from crossloc3d_ros.evaluation.statistics import (
+    RADII_M,
+    Recall,
+    chance_level,
+    find_recall,
+    one_per_cent,
+    wilson_share,
+)
 from crossloc3d_ros.localization.retrieval.candidates import heading_angles
 from crossloc3d_ros.localization.retrieval.place_belief import calibrate
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
-RADII_M = (100.0, 50.0, 25.0)
 TOP = (1, 5, 25)
 QUANTILES = (0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
 
@@ -32,28 +40,13 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Recall:
-    """Share of queries with a submap within `radius_m` among the nearest `count` by descriptor."""
-
-    radius_m: float
-    count: int
-    label: str
-    """`R@5`, or `R@1%` where the count is that share of the database."""
-    value: float
-    chance: float
-    """What a random order would reach."""
-    low: float
-    """95 % Wilson interval over the queries, as if they were independent."""
-    high: float
-
-
-@dataclass(frozen=True)
 class Validation:
     """One look at the held-out towns: aerial database, ground queries, headings over the full circle."""
 
     queries: int
     submaps: int
     recalls: tuple[Recall, ...]
+    """With Wilson's intervals over the queries, as if these were independent."""
     true_distances: tuple[float, ...]
     """Quantiles (`QUANTILES`) of the descriptor distance from a scan to the submap that is centred nearest."""
     false_distances: tuple[float, ...]
@@ -62,8 +55,24 @@ class Validation:
     """What the localizer should make of the distances."""
 
     def recall(self, label: str, radius_m: float) -> Recall:
-        """Return one figure, as `recall("R@1", 100.0)`."""
-        return next(r for r in self.recalls if r.label == label and r.radius_m == radius_m)
+        """Return one recall, as `recall("R@1", 100.0)`; KeyError where there is none."""
+        return find_recall(self.recalls, label, radius_m)
+
+    def stored(self) -> dict[str, Any]:
+        """Return what logs and weights keep of it."""
+        recalls = [
+            {
+                "radius_m": recall.radius_m,
+                "count": recall.rank,
+                "label": recall.label,
+                "value": recall.share.value,
+                "chance": recall.chance,
+                "low": recall.share.low,
+                "high": recall.share.high,
+            }
+            for recall in self.recalls
+        ]
+        return {**dataclasses.asdict(self), "recalls": recalls}
 
 
 def ground_distances(queries: Places, submaps: Places) -> Float64Array:
@@ -83,18 +92,17 @@ def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validatio
     order = np.argsort(descriptor_distances, axis=1, kind="stable")
     ranked_metres = np.take_along_axis(metres, order, axis=1)
     recalls = []
-    one_per_cent = max(1, math.ceil(submaps / 100))
+    ranks = [*((f"R@{k}", k) for k in TOP), ("R@1%", one_per_cent(submaps, rounded_up=True))]
     for radius_m in RADII_M:
         right = ranked_metres <= radius_m
         possible = right.any(axis=1)
         right = right[possible]
         first = right.argmax(axis=1)
-        matches = right.sum(axis=1)
-        for label, count in [*((f"R@{k}", k) for k in TOP), ("R@1%", one_per_cent)]:
-            hits = int((first < count).sum())
-            chance = float(chance_of_hit(matches, submaps, count).mean()) if len(matches) else 0.0
-            share = wilson_share(hits / max(1, len(first)), len(first))
-            recalls.append(Recall(radius_m, count, label, share.value, chance, share.low, share.high))
+        chance = chance_level(right.sum(axis=1), submaps, max(rank for _, rank in ranks))
+        for label, rank in ranks:
+            share = wilson_share(int((first < rank).sum()) / max(1, len(first)), len(first))
+            level = float(chance[rank - 1]) if len(first) else 0.0
+            recalls.append(Recall(rank, radius_m, share, level, label))
     true = np.take_along_axis(descriptor_distances, metres.argmin(axis=1)[:, None], axis=1)[:, 0]
     false = np.where(metres > max(RADII_M), descriptor_distances, math.inf).min(axis=1)
     return Validation(

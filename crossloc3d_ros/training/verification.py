@@ -14,12 +14,12 @@ from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.evaluation.retrieval.encoding import EncodingJob
 from crossloc3d_ros.evaluation.retrieval.predictions import Plan, metres_of, predict_all, way_of
 from crossloc3d_ros.evaluation.retrieval.verification import compare, scores_of, temperature_of
+from crossloc3d_ros.evaluation.statistics import RADII_M
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 RIGHT_M = 25.0
 """An answer is right within this."""
-RADII_M = (100.0, 50.0, 25.0)
 _NEAREST_COUNT = 1e-3  # pull of both logarithms towards 0: keeps them finite where one distance tells everything
 
 Progress = Callable[[str, float, float, str], None]

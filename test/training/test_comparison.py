@@ -17,9 +17,9 @@ from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.encoder.checkpoint import load_checkpoint
 from crossloc3d_ros.encoder.networks import make_network
 from crossloc3d_ros.errors import ConfigError, TrainingError
-from crossloc3d_ros.evaluation.recall import Share
 from crossloc3d_ros.evaluation.retrieval.predictions import load_predictions
 from crossloc3d_ros.evaluation.retrieval.scores import score
+from crossloc3d_ros.evaluation.statistics import Share
 from crossloc3d_ros.training import comparison
 from crossloc3d_ros.training.comparison import TABLES, Comparison, Result, Row, rows_of, select
 from crossloc3d_ros.training.comparison_table import (
@@ -139,10 +139,8 @@ def test_a_table_holds_what_was_measured(done: Comparison, examined: EvaluationS
     for row in done.rows:
         result, folder = results[row.slug], done.folder / row.slug
         figures = score(load_predictions(folder / "predictions.npz"), examined).overall
-        for cell in result.cells:
-            figure = figures.figure(f"R@{cell.rank}", cell.radius_m)
-            assert (cell.recall, cell.low, cell.high) == (figure.share.value, figure.share.low, figure.share.high)
-            assert cell.chance == figure.chance
+        for recall in result.recalls:
+            assert recall == figures.recall(f"R@{recall.rank}", recall.radius_m)
         assert result.one_thread_ms > 0
         if row.config is None:
             assert (result.parameters, result.steps, result.clouds) == (0, 0, 0)
@@ -157,7 +155,9 @@ def test_a_table_holds_what_was_measured(done: Comparison, examined: EvaluationS
     for slug in ("height_maps", "minkloc3d_coarser"):
         ahead = results[slug].ahead
         assert ahead is not None
-        assert ahead.value == pytest.approx(results[slug].cell(1, 100.0).recall - reference.cell(1, 100.0).recall)
+        assert ahead.value == pytest.approx(
+            results[slug].recall(1, 100.0).share.value - reference.recall(1, 100.0).share.value
+        )
 
 
 def test_a_table_that_is_done_stays_as_it_is(table: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +180,7 @@ def test_what_was_stopped_before_its_examination_is_examined(
     assert [result.slug for result in table.results()] == ["height_maps"]
     monkeypatch.setattr(Trainer, "run", None)
     after = table.run()
-    assert [result.cells for result in after] == [result.cells for result in before]
+    assert [result.recalls for result in after] == [result.recalls for result in before]
 
 
 def test_a_run_that_was_killed_goes_on(table: Comparison) -> None:
@@ -223,15 +223,15 @@ def test_the_tables_say_what_the_results_hold(done: Comparison, tmp_path: Path) 
     lines = list(csv.DictReader(paths[0].read_text().splitlines()))
     for line, result in zip(lines, results, strict=True):
         assert line["slug"] == result.slug
-        assert float(line["r25_100m"]) == pytest.approx(result.cell(25, 100.0).recall, abs=1e-6)
-        assert float(line["r1_25m_chance"]) == pytest.approx(result.cell(1, 25.0).chance, abs=1e-6)
+        assert float(line["r25_100m"]) == pytest.approx(result.recall(25, 100.0).share.value, abs=1e-6)
+        assert float(line["r1_25m_chance"]) == pytest.approx(result.recall(1, 25.0).chance, abs=1e-6)
         assert int(line["parameters"]) == result.parameters
     markdown, page = paths[1].read_text(), paths[2].read_text()
     rows = [line for line in markdown.splitlines() if line.startswith("| ")]
     assert len({line.count("|") for line in rows}) == 1
     for result in results:
-        cell = result.cell(1, 100.0)
-        shown = f"{100 * cell.recall:.1f} [{100 * cell.low:.0f}–{100 * cell.high:.0f}]"
+        share = result.recall(1, 100.0).share
+        shown = f"{100 * share.value:.1f} [{100 * share.low:.0f}–{100 * share.high:.0f}]"
         assert any(line.startswith(f"| {result.name} |") and shown in line for line in rows)
         assert shown in page
     assert "Competitors &lt;here&gt;" in page
@@ -325,4 +325,4 @@ def test_results_survive_the_disk(done: Comparison) -> None:
     (again,) = dataclasses.replace(done, rows=[row]).results()
     assert isinstance(again, Result)
     assert again.published == row.published
-    assert again.cell(1, 25.0).radius_m == 25.0
+    assert again.recall(1, 25.0).radius_m == 25.0

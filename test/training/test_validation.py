@@ -26,9 +26,9 @@ def test_recall_counts_the_queries_whose_nearest_descriptors_hold_a_near_place()
     metres = np.array([[10.0, 30.0, 90.0, 500.0], [500.0, 20.0, 500.0, 500.0]])
     descriptors = np.array([[3.0, 2.0, 1.0, 9.0], [1.0, 4.0, 2.0, 3.0]])
     result = score(descriptors, metres)
-    assert result.recall("R@1", 100.0).value == 0.5  # query 0 finds the place 90 m away, query 1 a wrong one
-    assert result.recall("R@1", 50.0).value == 0.0
-    assert result.recall("R@5", 25.0).value == 1.0
+    assert result.recall("R@1", 100.0).share.value == 0.5  # query 0 finds the place 90 m away, query 1 a wrong one
+    assert result.recall("R@1", 50.0).share.value == 0.0
+    assert result.recall("R@5", 25.0).share.value == 1.0
     assert result.recall("R@1", 100.0).chance == pytest.approx((3 / 4 + 1 / 4) / 2)
     assert result.true_distances[4] == pytest.approx(np.median([3.0, 4.0]))
     assert result.false_distances[4] == pytest.approx(np.median([9.0, 1.0]))
@@ -39,12 +39,12 @@ def test_chance_is_what_random_descriptors_reach() -> None:
     metres = rng.uniform(0.0, 1000.0, (4000, 60))
     result = score(rng.random((4000, 60)), metres)
     for recall in result.recalls:
-        assert recall.value == pytest.approx(recall.chance, abs=0.03), recall
+        assert recall.share.value == pytest.approx(recall.chance, abs=0.03), recall
 
 
 def test_the_true_one_per_cent_grows_with_the_database() -> None:
     result = score(np.random.default_rng(0).random((3, 730)), np.full((3, 730), 10.0))
-    assert result.recall("R@1%", 100.0).count == 8
+    assert result.recall("R@1%", 100.0).rank == 8
 
 
 def test_a_query_turned_by_steps_finds_the_submap_that_a_heading_sensitive_code_gives_only_aligned() -> None:
@@ -58,6 +58,6 @@ def test_a_query_turned_by_steps_finds_the_submap_that_a_heading_sensitive_code_
     def encode(clouds: list[Float32Array]) -> Float32Array:
         return np.stack([cloud[:, :2].ravel() for cloud in clouds])  # as sensitive to heading as can be
 
-    assert validate([town], encode, 8).recall("R@1", 25.0).value == 1.0
-    assert validate([town], encode, 1).recall("R@1", 25.0).value < 0.6
+    assert validate([town], encode, 8).recall("R@1", 25.0).share.value == 1.0
+    assert validate([town], encode, 1).recall("R@1", 25.0).share.value < 0.6
     assert max(validate([town], encode, 8).true_distances) < 1e-4

@@ -11,8 +11,9 @@ from markupsafe import Markup
 from scipy.stats import chi2
 
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
+from crossloc3d_ros.evaluation.drives.place_scores import RANKS, Scores
 from crossloc3d_ros.evaluation.drives.track_scores import SIGMAS, WRONG_M, TrackScores, believed_error_m, contents
-from crossloc3d_ros.evaluation.recall import RANKS, Scores, horizontal_distances, submaps_within
+from crossloc3d_ros.evaluation.statistics import horizontal_distances, submaps_within
 from crossloc3d_ros.pages import charts
 from crossloc3d_ros.pages.wording import percent_range
 from crossloc3d_ros.types import Float64Array, TrackState

@@ -19,8 +19,8 @@ from crossloc3d_ros.evaluation.drives.estimates import (
     read_estimates,
     write_geojson,
 )
+from crossloc3d_ros.evaluation.drives.place_scores import Scores, score
 from crossloc3d_ros.evaluation.drives.track_scores import TrackScores, score_track
-from crossloc3d_ros.evaluation.recall import Scores, score
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.formats.bag import BagReader
 
@@ -106,11 +106,18 @@ def write_summary(folder: Path, evaluation: Evaluation, about: dict[str, Any]) -
             "fixes": len(evaluation.truth),
             "dropped": evaluation.truth.dropped,
         },
-        "scores": None if evaluation.scores is None else asdict(evaluation.scores),
+        "scores": None if evaluation.scores is None else _stored(evaluation.scores),
         "track": None if evaluation.track is None else asdict(evaluation.track),
         "latency_ms": latency_summary(evaluation.table),
     }
     write_atomically(folder / SUMMARY, json.dumps(_without_nan(summary), indent=2, allow_nan=False) + "\n")
+
+
+def _stored(scores: Scores) -> dict[str, Any]:
+    content = asdict(scores)
+    for recall in content["recalls"]:
+        del recall["label"]  # the rank once more
+    return content
 
 
 def latency_summary(table: EstimateTable) -> dict[str, float]:

@@ -18,8 +18,9 @@ from crossloc3d_ros.evaluation.drives import charts
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
 from crossloc3d_ros.evaluation.drives.evaluation import Evaluation
 from crossloc3d_ros.evaluation.drives.page_map import MapView, grid_turn_rad, map_view, page_data
+from crossloc3d_ros.evaluation.drives.place_scores import RANKS, Scores
 from crossloc3d_ros.evaluation.drives.track_scores import CARRIED, FROM_NOTHING, LOST, WRONG_M, Search, TrackScores
-from crossloc3d_ros.evaluation.recall import INDEPENDENT_M, RADII_M, RANKS, Scores, horizontal_distances
+from crossloc3d_ros.evaluation.statistics import INDEPENDENT_M, RADII_M, horizontal_distances
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.pages.backdrop import draw_backdrop

@@ -11,7 +11,7 @@ import numpy as np
 from crossloc3d_ros.datasets.truth import jumped
 from crossloc3d_ros.evaluation.drives.charts import STATE_WORDS, WORST, class_of, error_classes, seconds_of
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, PoseLists
-from crossloc3d_ros.evaluation.recall import CHI2_2D_95
+from crossloc3d_ros.evaluation.statistics import CHI2_2D_95
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.pages.backdrop import Backdrop
 from crossloc3d_ros.pages.wording import rounded

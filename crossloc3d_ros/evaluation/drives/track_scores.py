@@ -8,14 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
 
 from crossloc3d_ros.datasets.truth import jumped
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
-from crossloc3d_ros.evaluation.recall import Share, independent_places, squared_mahalanobis, wilson_share
+from crossloc3d_ros.evaluation.statistics import (
+    ReliabilityBin,
+    independent_places,
+    quantile,
+    reliability,
+    squared_mahalanobis,
+)
 from crossloc3d_ros.types import BoolArray, Float64Array
 
 WRONG_M = 10.0
@@ -58,18 +63,6 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class BeliefRange:
-    """How often a belief was right."""
-
-    low: float
-    high: float
-    scans: int
-    mean_belief: float
-    right: Share
-    """Share of errors below `WRONG_M`, with the interval for as many places, not scans."""
-
-
-@dataclass(frozen=True)
 class Search:
     """A stretch of the drive without a right fix."""
 
@@ -96,7 +89,7 @@ class TrackScores:
     fixes: int
     errors: PoseErrors
     coverage: tuple[Coverage, ...]
-    beliefs: tuple[BeliefRange, ...]
+    beliefs: tuple[ReliabilityBin, ...]
     searches: tuple[Search, ...]
     """The first from the start, those after the robot was carried away, and gaps of `_SHORT_M` and more."""
     short_gaps: int
@@ -161,12 +154,12 @@ def pose_errors(table: EstimateTable) -> PoseErrors:
     wrong = int((errors > WRONG_M).sum())
     return PoseErrors(
         count=len(errors),
-        median_m=_quantile(errors, 0.5),
-        p95_m=_quantile(errors, 0.95),
-        max_m=_quantile(errors, 1.0),
+        median_m=quantile(errors, 0.5),
+        p95_m=quantile(errors, 0.95),
+        max_m=quantile(errors, 1.0),
         headings=len(headings),
-        median_deg=_quantile(headings, 0.5),
-        p95_deg=_quantile(headings, 0.95),
+        median_deg=quantile(headings, 0.5),
+        p95_deg=quantile(headings, 0.95),
         wrong=wrong,
         wrong_share=wrong / len(errors) if len(errors) else math.nan,
     )
@@ -212,22 +205,16 @@ def believed_error_m(table: EstimateTable) -> Float64Array:
     return np.asarray(np.hypot(*(place - table.truth_grid).T))
 
 
-def beliefs(table: EstimateTable, borders: Sequence[float] = BELIEFS) -> tuple[BeliefRange, ...]:
-    """Return for ranges of believed probability, fix or not, how often the error was below `WRONG_M`."""
+def beliefs(table: EstimateTable, borders: Sequence[float] = BELIEFS) -> tuple[ReliabilityBin, ...]:
+    """Return for ranges of believed probability, fix or not, how often the error was below `WRONG_M`.
+
+    The intervals are for as many places, not scans.
+    """
     off_m = believed_error_m(table)
     known = np.isfinite(table.probability) & np.isfinite(off_m)
-    right = off_m < WRONG_M
-    rows = []
-    for low, high in pairwise(borders):
-        last = high == borders[-1]
-        inside = (
-            known & (table.probability >= low) & ((table.probability <= high) if last else table.probability < high)
-        )
-        scans = int(inside.sum())
-        if scans:
-            share = wilson_share(float(right[inside].mean()), independent_places(table.truth_grid[inside]))
-            rows.append(BeliefRange(low, high, scans, float(table.probability[inside].mean()), share))
-    return tuple(rows)
+    truth = table.truth_grid[known]
+    right = np.asarray(off_m[known] < WRONG_M, dtype=np.bool_)
+    return reliability(table.probability[known], right, borders, lambda inside: independent_places(truth[inside]))
 
 
 def find_searches(table: EstimateTable, way_m: Float64Array, carried: BoolArray) -> tuple[tuple[Search, ...], int]:
@@ -279,7 +266,3 @@ def _search(
         cause=cause,
         wrong_fixes=int(wrong.sum()),
     )
-
-
-def _quantile(values: Float64Array, share: float) -> float:
-    return float(np.quantile(values, share)) if len(values) else math.nan

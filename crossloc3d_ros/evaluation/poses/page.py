@@ -26,6 +26,7 @@ from crossloc3d_ros.evaluation.poses.scores import (
 )
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
+from crossloc3d_ros.pages.wording import percent
 
 _MARKS = {"goal": ("✓ goal", "right"), "floor": ("– floor", "fair"), "below": ("✗ below", "miss"), "": ("", "")}
 
@@ -106,9 +107,9 @@ def _stage_table(title: str, stages: Sequence[Stage]) -> str:
         interval = f"{100 * each.within_low:.0f} to {100 * each.within_high:.0f} %"
         rows.append(
             f"<tr><th scope='row'>{escape(each.name)}<small>{each.scans:,} scans</small></th>"
-            f"<td><b>{_percent(each.within)}</b><div class='gauge'><i style='width:{_width(each.within)}%'></i></div>"
-            f"<small>{interval}</small></td><td>{_percent(each.within_10_m)}</td>"
-            f"<td>{_percent(each.within_50_m)}</td><td>{middle}</td></tr>"
+            f"<td><b>{percent(each.within, 1)}</b><div class='gauge'><i style='width:{_width(each.within)}%'></i></div>"
+            f"<small>{interval}</small></td><td>{percent(each.within_10_m, 1)}</td>"
+            f"<td>{percent(each.within_50_m, 1)}</td><td>{middle}</td></tr>"
         )
     return (
         f'<div class="scroll"><table class="recall"><caption>{escape(title)}</caption><thead><tr><th scope="col">'
@@ -228,10 +229,6 @@ def _words(scores: PoseScores, words: Sequence[str]) -> str:
         *(f"<p>{escape(sentence)}</p>" for sentence in words),
     ]
     return "".join(paragraphs)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if math.isfinite(share) else "–"
 
 
 def _width(share: float) -> str:

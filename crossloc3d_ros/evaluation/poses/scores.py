@@ -1,8 +1,6 @@
 """From answers to the figures of the pose benchmark: pure functions over `PosePredictions`.
 
-What is counted is said at each measure. Intervals are those of `scores`: a bootstrap over towns, or over squares of
-50 m where fewer than eight towns were asked; a share's interval is widened to hold Wilson's for as many trials as there
-are places 25 m apart, so that nothing wrong in a few trials is no proof of anything.
+What is counted is said at each measure. Intervals are those of `statistics`.
 """
 
 from __future__ import annotations
@@ -15,8 +13,15 @@ from typing import Literal
 import numpy as np
 
 from crossloc3d_ros.evaluation.poses.predictions import SINGLE, PoseAbout, PosePredictions, number_of_alone, select
-from crossloc3d_ros.evaluation.recall import independent_places, squared_mahalanobis
-from crossloc3d_ros.evaluation.retrieval.scores import bootstrap_draws, clusters_among, share_of
+from crossloc3d_ros.evaluation.statistics import (
+    clustered_quantile,
+    clustered_share,
+    clusters_of,
+    independent_places_in_areas,
+    quantile,
+    reliability,
+    squared_mahalanobis,
+)
 from crossloc3d_ros.simulation.families import HELD_OUT_FAMILIES
 from crossloc3d_ros.types import WHOLE_MAP, BoolArray, Float64Array, Int64Array
 
@@ -28,7 +33,7 @@ AMONG_M = 50.0
 """A scan's place is among the candidates where one of their centres is so near: the submap holds the robot."""
 SIGMAS = np.linspace(0.0, 4.0, 41)
 _TWO_SIGMA = 0.9545
-_BINS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99, 0.999, 0.9999, 1.0])
+_BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99, 0.999, 0.9999, 1.0)
 """Of believed probabilities; fine where it matters."""
 
 Unit = Literal["%", "m", "degrees", "fixes", "ms"]
@@ -245,40 +250,23 @@ def _legs(track: PosePredictions) -> list[Int64Array]:
 
 
 def _clusters(predictions: PosePredictions) -> Int64Array:
-    return clusters_among(predictions.area, predictions.truth[:, :2])
+    return clusters_of(predictions.area, predictions.truth[:, :2])
 
 
 def _places(predictions: PosePredictions) -> int:
-    return sum(independent_places(predictions.truth[predictions.area == area]) for area in np.unique(predictions.area))
+    return independent_places_in_areas(predictions.area, predictions.truth[:, :2])
 
 
 def _share(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: _Goals) -> Measure:
-    share = share_of(hit, _clusters(of), _places(of))
+    share = clustered_share(hit, _clusters(of), _places(of))
     return goals.measure(key, text, "%", share.value, share.low, share.high, len(hit), counted)
 
 
 def _quantile(
     key: str, text: str, unit: Unit, values: Float64Array, of: PosePredictions, q: float, counted: str, goals: _Goals
 ) -> Measure:
-    value, low, high = quantile_interval(values, _clusters(of), q)
+    value, low, high = clustered_quantile(values, _clusters(of), q)
     return goals.measure(key, text, unit, value, low, high, len(values), counted)
-
-
-def quantile_interval(values: Float64Array, clusters: Int64Array, q: float) -> tuple[float, float, float]:
-    """Return a quantile of values (N,), which may be infinite, and its interval when whole clusters are drawn."""
-    if not len(values):
-        return math.nan, math.nan, math.nan
-    numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
-    order = np.argsort(values, kind="stable")
-    ordered, drawn = values[order], bootstrap_draws(int(numbers.max()) + 1)[:500]
-    reached = np.cumsum(drawn[:, numbers[order]], axis=1)
-    totals = reached[:, -1]
-    chosen = (reached < q * totals[:, None]).sum(axis=1)
-    resampled = np.sort(ordered[np.minimum(chosen, len(ordered) - 1)])
-    plain = ordered[min(math.ceil(q * len(ordered)) - 1 if q > 0 else 0, len(ordered) - 1)]
-    middle = float(np.median(values)) if q == 0.5 and np.isfinite(values).all() else float(plain)
-    low, high = resampled[int(0.025 * len(resampled))], resampled[min(int(0.975 * len(resampled)), len(resampled) - 1)]
-    return middle, min(float(low), middle), max(float(high), middle)
 
 
 @dataclass(frozen=True)
@@ -390,7 +378,7 @@ def _away_measures(away: PosePredictions, driven: PosePredictions, goals: _Goals
 
 def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
     total = predictions.milliseconds.sum(axis=1)
-    median, high = (float(np.quantile(total, q)) if len(total) else math.nan for q in (0.5, 0.95))
+    median, high = quantile(total, 0.5), quantile(total, 0.95)
     return (
         Measure("scan_ms", "a scan, median", "ms", median, median, median, len(total), "scans"),
         Measure("scan_ms_95", "a scan, 95 %", "ms", high, high, high, len(total), "scans"),
@@ -399,7 +387,7 @@ def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
 
 def _stage(name: str, of: PosePredictions, answer: Float64Array) -> Stage:
     metres = _distance(of, answer)
-    share = share_of(is_right(of, answer), _clusters(of), _places(of))
+    share = clustered_share(is_right(of, answer), _clusters(of), _places(of))
     middle = float(np.median(metres)) if len(metres) else math.nan
     near, far = (float(np.mean(metres <= radius)) if len(metres) else math.nan for radius in (10.0, 50.0))
     return Stage(name, len(of), share.value, share.low, share.high, near, far, middle)
@@ -447,13 +435,13 @@ def _family_measures(singles: PosePredictions, about: PoseAbout) -> tuple[Measur
 
 def calibration_of(name: str, believed: Float64Array, right: BoolArray) -> Calibration:
     """Compare probabilities (N,) with what was right (N,), in bins; NaN counts as no belief at all."""
-    believed = np.where(np.isfinite(believed), believed, 0.0)
-    number = np.clip(np.searchsorted(_BINS, believed, side="right") - 1, 0, len(_BINS) - 2)
-    count = np.bincount(number, minlength=len(_BINS) - 1)
-    filled = count > 0
-    mean = np.bincount(number, believed, len(_BINS) - 1)[filled] / count[filled]
-    share = np.bincount(number, right.astype(np.float64), len(_BINS) - 1)[filled] / count[filled]
-    return Calibration(name, mean, share, count[filled].astype(np.int64))
+    bins = reliability(np.where(np.isfinite(believed), believed, 0.0), right, _BINS)
+    return Calibration(
+        name,
+        np.array([each.mean_belief for each in bins]),
+        np.array([each.right.value for each in bins]),
+        np.array([each.scans for each in bins], np.int64),
+    )
 
 
 def _calibrations(singles: PosePredictions, track: PosePredictions, away: PosePredictions) -> tuple[Calibration, ...]:

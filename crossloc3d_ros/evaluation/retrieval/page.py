@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +14,11 @@ import numpy as np
 from crossloc3d_ros.evaluation.retrieval.gallery import TOP, Picture, Row
 from crossloc3d_ros.evaluation.retrieval.predictions import About
 from crossloc3d_ros.evaluation.retrieval.results import label_of
-from crossloc3d_ros.evaluation.retrieval.scores import CURVE, RADII_M, Figure, GroupScores, Scores
+from crossloc3d_ros.evaluation.retrieval.scores import CURVE, GroupScores, Scores
+from crossloc3d_ros.evaluation.statistics import RADII_M, Recall
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
+from crossloc3d_ros.pages.wording import interval, percent
 
 _MOST_LINES = 8
 _CURVE_RADII_M = (100.0, 25.0)
@@ -86,12 +87,13 @@ def _page_file(name: str) -> str:
 
 
 def _verdict(main: Scores) -> str:
-    best, near = main.overall.figure("R@1", 100.0), main.overall.figure("R@1", 25.0)
+    best, near = main.overall.recall("R@1", 100.0), main.overall.recall("R@1", 25.0)
     return (
         f"Asked for the place of <b>{main.overall.queries:,}</b> ground scans among "
         f"<b>{main.about.database:,}</b> places ({escape(describe(main.about))}), <b>{escape(main.about.weights)}</b> "
-        f"names one within 100 m first in <b>{percent(best.share.value)}</b> of the cases (95 % interval "
-        f"{interval(best)}, by lot {percent(best.chance)}), one within 25 m in <b>{percent(near.share.value)}</b>."
+        f"names one within 100 m first in <b>{percent(best.share.value, 1)}</b> of the cases (95 % interval "
+        f"{interval(best.share)}, by lot {percent(best.chance, 1)}), one within 25 m in "
+        f"<b>{percent(near.share.value, 1)}</b>."
     )
 
 
@@ -103,8 +105,10 @@ def _tiles(main: Scores) -> str:
         ("R@25", 100.0, "Within 100 m among 25"),
         ("R@1%", 100.0, "In the first per cent"),
     ):
-        figure = main.overall.figure(label, radius)
-        tiles.append((what, percent(figure.share.value), f"{interval(figure)}; by lot {percent(figure.chance)}"))
+        figure = main.overall.recall(label, radius)
+        tiles.append(
+            (what, percent(figure.share.value, 1), f"{interval(figure.share)}; by lot {percent(figure.chance, 1)}")
+        )
     about = main.about
     once = "one descriptor" if about.query_headings == 1 else f"{about.query_headings} descriptors"
     again = f", height maps {about.verify_ms:.1f} ms ({about.verified:,} places)" if about.verified else ""
@@ -118,13 +122,13 @@ def _tiles(main: Scores) -> str:
 
 
 def _recall_table(scores: Sequence[Scores], main: Scores, radius_m: float) -> str:
-    labels = [figure for figure in main.overall.figures if figure.radius_m == radius_m]
+    labels = [figure for figure in main.overall.recalls if figure.radius_m == radius_m]
     head = "".join(f"<th scope='col'>{escape(label_of(figure))}</th>" for figure in labels)
     rows = []
     for each in scores:
-        cells = "".join(_cell(each.overall.figure(figure.label, radius_m)) for figure in labels)
+        cells = "".join(_cell(each.overall.recall(figure.label, radius_m)) for figure in labels)
         css = ' class="headline"' if each is main else ""
-        counted = each.overall.figure("R@1", radius_m).queries
+        counted = each.overall.counted[radius_m]
         note = f"<small>{counted:,} queries, {each.about.database:,} places; by {each.about.kind}</small>"
         rows.append(f"<tr{css}><th scope='row'>{escape(describe(each.about))}{note}</th>{cells}</tr>")
     return (
@@ -134,14 +138,14 @@ def _recall_table(scores: Sequence[Scores], main: Scores, radius_m: float) -> st
     )
 
 
-def _cell(figure: Figure) -> str:
-    if figure.queries == 0:
+def _cell(figure: Recall) -> str:
+    if np.isnan(figure.share.value):  # no query has a place so near
         return "<td>–</td>"
     return (
-        f"<td><b>{percent(figure.share.value)}</b>"
+        f"<td><b>{percent(figure.share.value, 1)}</b>"
         f'<div class="gauge"><i style="width:{100 * figure.share.value:.1f}%"></i>'
         f'<s style="left:{100 * figure.chance:.1f}%"></s></div>'
-        f"<small>{interval(figure)}</small><small>by lot {percent(figure.chance)}</small></td>"
+        f"<small>{interval(figure.share)}</small><small>by lot {percent(figure.chance, 1)}</small></td>"
     )
 
 
@@ -182,15 +186,15 @@ def _curve_legend(scores: Sequence[Scores], main: Scores) -> str:
 
 def _gallery(pictures: tuple[list[Row], list[Row]], main: Scores, width_m: float) -> str:
     right, wrong = pictures
-    share = main.overall.figure("R@1", 100.0)
+    share = main.overall.recall("R@1", 100.0)
     reached = int((main.first_m <= 100.0).sum())
     text = (
         f"<p>Clouds seen from above, {width_m:g} m wide, north up; brighter is higher. Left the scan, beside it the "
         f"first {TOP} answers with their distance from the robot: framed green within 100 m, red beyond. The scan is "
         "drawn north up only so that eyes can compare. Shown are queries drawn by lot with a "
         f"fixed seed, {len(right)} of the {reached:,} whose first answer is right and {len(wrong)} of the "
-        f"{main.overall.queries - reached:,} where it is wrong: half and half here, {percent(share.share.value)} right "
-        "in truth.</p>"
+        f"{main.overall.queries - reached:,} where it is wrong: half and half here, {percent(share.share.value, 1)} "
+        "right in truth.</p>"
     )
     parts = [text]
     for title, rows in (("The first answer is right", right), ("The first answer is wrong", wrong)):
@@ -229,14 +233,14 @@ def _divided_table(main: Scores) -> str:
 
 
 def _divided_row(group: GroupScores, columns: Sequence[tuple[str, float]], css: str) -> str:
-    cells = "".join(_cell(group.figure(label, radius)) for label, radius in columns)
+    cells = "".join(_cell(group.recall(label, radius)) for label, radius in columns)
     areas = f"{group.areas} area{'s' * (group.areas != 1)}"
     note = f"<small>{group.queries:,} queries in {areas}</small>"
     return f"<tr class='{css}'><th scope='row'>{escape(group.name.replace('_', ' '))}{note}</th>{cells}</tr>"
 
 
 def _words(scores: Sequence[Scores], main: Scores, texts: PageTexts) -> str:
-    one_per_cent = main.overall.figure("R@1%", 100.0).rank
+    one_per_cent = main.overall.recall("R@1%", 100.0).rank
     paragraphs = [
         "<h3>Recall</h3><p>R@N within a radius is the share of queries for which one of the first N answers is centred "
         "within the radius of the true place. Queries without any place of the database within the radius cannot be "
@@ -281,15 +285,5 @@ def _heading_words(main: Scores) -> list[str]:
         f"<h3>The heading that comes with an answer</h3><p>Each query was tried every {errors.step_deg:g} degrees. Of "
         f"the {errors.queries:,} first answers within 100 m, the heading in which the query lay nearest was off by "
         f"{errors.median_deg:.0f} degrees in the median, and by at most one step in "
-        f"{percent(errors.within_step)}.</p>"
+        f"{percent(errors.within_step, 1)}.</p>"
     ]
-
-
-def percent(share: float) -> str:
-    """Return a share for people, with a digit where it matters."""
-    return f"{100 * share:.1f} %" if math.isfinite(share) else "–"
-
-
-def interval(figure: Figure) -> str:
-    """Return the interval of a figure for people."""
-    return f"{100 * figure.share.low:.0f} to {100 * figure.share.high:.0f} %"

@@ -27,6 +27,7 @@ from crossloc3d_ros.evaluation.retrieval.encoding import (
     north_angles,
     time_queries,
 )
+from crossloc3d_ros.evaluation.statistics import one_per_cent
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.localization.retrieval.candidates import heading_angles
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array, Float64Array, HeadingEncoder, Int64Array
@@ -197,7 +198,7 @@ def predict_all(evaluation_set: EvaluationSet, job: EncodingJob, plan: Plan, wei
     timed: dict[int, tuple[float, float]] = {}
     for setting in plan.settings:
         database = np.concatenate(encoded if setting == "aerial+ground" else encoded[:1])[:, 0]
-        top = min(len(database), max(STORED, plan.kept, one_per_cent(len(database))))
+        top = min(len(database), max(STORED, plan.kept, one_per_cent(len(database), rounded_up=False)))
         index = DescriptorMap(database) if own is None else None
         for mode, count, way, descriptors in ways:
             if count not in timed:
@@ -225,11 +226,6 @@ def driven_angles(queries: PlaceSet) -> Float64Array:
     by_lot = np.random.default_rng(_LOT_SEED).uniform(0.0, 2.0 * np.pi, len(queries))
     as_driven = np.isfinite(queries.heading_rad) & (queries.heading_rad != 0.0)
     return np.where(as_driven, 0.0, by_lot)[:, None]
-
-
-def one_per_cent(database: int) -> int:
-    """Return how many places one per cent of a database is, rounded as the released evaluators round it."""
-    return max(1, round(database / 100.0))
 
 
 def nearest(index: DescriptorMap, queries: Float32Array, top: int) -> tuple[Int64Array, Float32Array, Int64Array]:

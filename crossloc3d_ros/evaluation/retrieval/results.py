@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from crossloc3d_ros.evaluation.retrieval.predictions import Way
-from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, Figure, Scores
+from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, Scores
+from crossloc3d_ros.evaluation.statistics import Recall
 
 _COLUMNS = (
     "benchmark", "weights", "setting", "heading", "query_headings", "way", "kind", "verified", "divided_by", "name",
@@ -19,9 +20,9 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def label_of(figure: Figure) -> str:
-    """Return a figure's label for people: R@25 is what was published as AR@1%."""
-    return f"{figure.label} (“AR@1%”)" if figure.rank == PUBLISHED_ONE_PER_CENT else figure.label
+def label_of(recall: Recall) -> str:
+    """Return a recall's label for people: R@25 is what was published as AR@1%."""
+    return f"{recall.label} (“AR@1%”)" if recall.rank == PUBLISHED_ONE_PER_CENT else recall.label
 
 
 def headline(scores: Sequence[Scores], query_headings: int, way: Way) -> Scores:
@@ -75,7 +76,7 @@ def _rows(scores: Scores) -> Iterator[dict[str, Any]]:
     about = scores.about
     for divided_by, groups in scores.tables().items():
         for group in groups:
-            for figure in group.figures:
+            for recall in group.recalls:
                 yield {
                     "benchmark": about.benchmark,
                     "weights": about.weights,
@@ -89,14 +90,14 @@ def _rows(scores: Scores) -> Iterator[dict[str, Any]]:
                     "name": group.name,
                     "queries": group.queries,
                     "areas": group.areas,
-                    "measure": figure.label,
-                    "rank": figure.rank,
-                    "radius_m": figure.radius_m,
-                    "counted": figure.queries,
-                    "recall": _number(figure.share.value),
-                    "low": _number(figure.share.low),
-                    "high": _number(figure.share.high),
-                    "chance": _number(figure.chance),
+                    "measure": recall.label,
+                    "rank": recall.rank,
+                    "radius_m": recall.radius_m,
+                    "counted": group.counted[recall.radius_m],
+                    "recall": _number(recall.share.value),
+                    "low": _number(recall.share.low),
+                    "high": _number(recall.share.high),
+                    "chance": _number(recall.chance),
                 }
 
 

@@ -3,17 +3,11 @@
 Which queries count: as in the released evaluators, those with at least one database place within the radius; others
 cannot be answered and are left out of that radius, their number is reported.
 
-What an interval means: queries of one town are alike, so towns are the independent pieces of evidence, not queries.
-Each interval is that of a bootstrap that draws whole towns with replacement (2,000 times, fixed seed, percentiles 2.5
-and 97.5). Where fewer than eight towns were asked, squares of 50 m inside of them take their place. A bootstrap of few
-and lucky towns is too narrow, at 0 and 100 % it has no width at all: the interval is widened to hold Wilson's for as
-many trials as there are places at least 25 m apart.
+Intervals are those of `statistics`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,43 +16,34 @@ from scipy.spatial import cKDTree
 
 from crossloc3d_ros.config import HeightMapConfig
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
-from crossloc3d_ros.evaluation.recall import Share, hits, independent_places, wilson_share
 from crossloc3d_ros.evaluation.retrieval.predictions import (
     About,
     Predictions,
     database_of,
     driven_angles,
     metres_of,
+)
+from crossloc3d_ros.evaluation.statistics import (
+    RADII_M,
+    Recall,
+    Share,
+    chance_level,
+    clustered_mean,
+    clustered_share,
+    clusters_of,
+    find_recall,
+    hits,
+    independent_places_in_areas,
     one_per_cent,
 )
 from crossloc3d_ros.localization.retrieval.candidates import heading_angles
 from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array
 
-RADII_M = (100.0, 50.0, 25.0)
 RANKS = (1, 5, 10, 25)
 CURVE = 100
 """Ranks of the AR@N curves."""
 PUBLISHED_ONE_PER_CENT = 25
 """What the released evaluators call AR@1%: they retrieve 25 results, whatever the size of the database."""
-_RESAMPLED = 2000
-_SEED = 12_345
-_LEAST_CLUSTERS = 8
-_BLOCK_M = 50.0
-
-
-@dataclass(frozen=True)
-class Figure:
-    """How often one of the first `rank` answers lies within `radius_m` of the query."""
-
-    label: str
-    """`R@5`, or `R@1%` where the rank is that share of the database."""
-    rank: int
-    radius_m: float
-    share: Share
-    chance: float
-    """What `rank` different places drawn by lot would reach."""
-    queries: int
-    """Queries counted: those with a place within the radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +64,13 @@ class GroupScores:
     name: str
     queries: int
     areas: int
-    figures: tuple[Figure, ...]
+    recalls: tuple[Recall, ...]
+    counted: Mapping[float, int]
+    """Queries with a place within each radius, of which the recalls are."""
 
-    def figure(self, label: str, radius_m: float) -> Figure:
-        """Return one figure, as `figure("R@1", 100.0)`."""
-        for figure in self.figures:
-            if figure.label == label and figure.radius_m == radius_m:
-                return figure
-        raise KeyError(f"no {label} within {radius_m} m")
+    def recall(self, label: str, radius_m: float) -> Recall:
+        """Return one recall, as `recall("R@1", 100.0)`; KeyError where there is none."""
+        return find_recall(self.recalls, label, radius_m)
 
 
 @dataclass(frozen=True)
@@ -195,45 +179,6 @@ def places_within(queries: PlaceSet, database: PlaceSet, radius_m: float) -> Int
     return counts
 
 
-def chance_curve(within: Int64Array, database: int, ranks: int) -> Float64Array:
-    """Return (ranks,) the mean chance that N = 1.. different places drawn by lot hold one of those within, (Q,)."""
-    if len(within) == 0:
-        return np.full(ranks, np.nan)
-    counts, times = np.unique(within, return_counts=True)
-    drawn = np.minimum(np.arange(ranks), database)
-    left = np.maximum(database - drawn, 1)[None, :]
-    miss = np.cumprod(np.clip(database - counts[:, None] - drawn[None, :], 0, None) / left, axis=1)
-    return np.asarray(1.0 - (times[:, None] * miss).sum(axis=0) / times.sum())
-
-
-def clusters_of(queries: PlaceSet) -> Int64Array:
-    """Return (Q,) which independent piece of evidence each query belongs to: its area, or a square of 50 m in it."""
-    return clusters_among(queries.area, queries.xy_m)
-
-
-def clusters_among(area: Int64Array, xy_m: Float64Array) -> Int64Array:
-    """Return the same (Q,) of areas (Q,) and positions (Q, 2)."""
-    areas = np.unique(area)
-    if len(areas) >= _LEAST_CLUSTERS:
-        return np.searchsorted(areas, area).astype(np.int64)
-    squares = np.column_stack([area, np.floor(xy_m / _BLOCK_M).astype(np.int64)])
-    return np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-
-
-def share_of(hit: BoolArray, clusters: Int64Array, places: int) -> Share:
-    """Return the share of hits (Q,) with its 95 % interval, as the module's docstring explains it.
-
-    `clusters` (Q,): the independent piece of evidence that each query belongs to; `places`: how many places at least
-    25 m apart the queries are.
-    """
-    if len(hit) == 0:
-        return Share(float("nan"), 0.0, 1.0)
-    low, high = _bootstrap(hit.astype(np.float64), clusters)
-    value = float(hit.mean())
-    wilson = wilson_share(value, places)
-    return Share(value, min(low, wilson.low), max(high, wilson.high))
-
-
 def difference(
     one: Predictions, other: Predictions, evaluation_set: EvaluationSet, rank: int = 1, radius_m: float = 100.0
 ) -> Share:
@@ -250,56 +195,30 @@ def difference(
     ahead = hit.astype(np.float64) - other_hit
     if len(ahead) == 0:
         return Share(float("nan"), -1.0, 1.0)
-    low, high = _bootstrap(ahead, clusters_of(_chosen(queries, counted)))
-    return Share(float(ahead.mean()), low, high)
-
-
-def _bootstrap(values: Float64Array, clusters: Int64Array) -> tuple[float, float]:
-    """Return the percentiles 2.5 and 97.5 of the mean of values (Q,) when whole clusters (Q,) are drawn by lot."""
-    numbers = np.unique(clusters, return_inverse=True)[1].reshape(-1)
-    sums, counts = np.bincount(numbers, values), np.bincount(numbers)
-    drawn = bootstrap_draws(len(sums))
-    low, high = np.percentile((drawn @ sums) / (drawn @ counts), [2.5, 97.5])
-    return float(low), float(high)
-
-
-@functools.lru_cache(maxsize=16)
-def bootstrap_draws(count: int) -> Float64Array:
-    """Return (resamplings, count) how often each of `count` clusters is drawn; always the same."""
-    drawn = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1.0 / count), _RESAMPLED)
-    return np.asarray(drawn, dtype=np.float64)
+    return clustered_mean(ahead, clusters_of(queries.area[counted], queries.xy_m[counted]))
 
 
 def _group(name: str, chosen: BoolArray, truths: Sequence[_Truth], queries: PlaceSet, database: int) -> GroupScores:
-    ranks = [*((f"R@{rank}", rank) for rank in RANKS), ("R@1%", one_per_cent(database))]
-    figures = []
+    ranks = [*((f"R@{rank}", rank) for rank in RANKS), ("R@1%", one_per_cent(database, rounded_up=False))]
+    recalls, counts = [], {}
     for truth in truths:
         counted = chosen & (truth.within > 0)
-        asked = _chosen(queries, counted)
-        clusters, places = clusters_of(asked), _independent(asked)
-        chance = chance_curve(truth.within[counted], database, max(rank for _, rank in ranks))
+        area, xy_m = queries.area[counted], queries.xy_m[counted]
+        clusters, places = clusters_of(area, xy_m), independent_places_in_areas(area, xy_m)
+        chance = _chance(truth.within[counted], database, max(rank for _, rank in ranks))
+        counts[truth.radius_m] = int(counted.sum())
         for label, rank in ranks:
-            share = share_of(truth.first_hit[counted] < rank, clusters, places)
-            figures.append(Figure(label, rank, truth.radius_m, share, float(chance[rank - 1]), int(counted.sum())))
-    return GroupScores(name, int(chosen.sum()), len(np.unique(queries.area[chosen])), tuple(figures))
+            share = clustered_share(truth.first_hit[counted] < rank, clusters, places)
+            recalls.append(Recall(rank, truth.radius_m, share, float(chance[rank - 1]), label))
+    return GroupScores(name, int(chosen.sum()), len(np.unique(queries.area[chosen])), tuple(recalls), counts)
 
 
 def _curve(truth: _Truth, database: int) -> Curve:
     counted = truth.within > 0
     first = truth.first_hit[counted]
     reached = np.array([(first < rank).mean() if len(first) else np.nan for rank in range(1, CURVE + 1)])
-    return Curve(truth.radius_m, reached, chance_curve(truth.within[counted], database, CURVE))
+    return Curve(truth.radius_m, reached, _chance(truth.within[counted], database, CURVE))
 
 
-def _chosen(queries: PlaceSet, chosen: BoolArray) -> PlaceSet:
-    """Return the places alone, without patches, of some queries."""
-    count = int(chosen.sum())
-    empty = np.zeros((count, 1, 3), np.float32)
-    return dataclasses.replace(
-        queries, patches=empty, area=queries.area[chosen], xy_m=queries.xy_m[chosen],
-        heading_rad=queries.heading_rad[chosen],
-    )  # fmt: skip
-
-
-def _independent(queries: PlaceSet) -> int:
-    return sum(independent_places(queries.xy_m[queries.area == area]) for area in np.unique(queries.area))
+def _chance(within: Int64Array, database: int, ranks: int) -> Float64Array:
+    return chance_level(np.sort(within), database, ranks)  # sorted: the sum rounds alike whatever the queries' order

@@ -8,8 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.evaluation.poses import results as pose_results
@@ -29,7 +27,6 @@ from crossloc3d_ros.evaluation.poses.scores import (
     calibration_of,
     expected_inside,
     localized_before,
-    quantile_interval,
     score_poses,
 )
 from crossloc3d_ros.types import WHOLE_MAP
@@ -237,23 +234,6 @@ def test_families_that_training_has_not_seen_are_told_apart() -> None:
     scores = score_poses(rows, ABOUT)
     assert scores.measure("end_to_end/held-out families").value == 0.0
     assert scores.measure("end_to_end/families seen in training").value == 1.0
-
-
-@given(st.lists(st.floats(0, 100), min_size=1, max_size=40), st.sampled_from([0.5, 0.95]), st.integers(1, 12))
-def test_a_quantile_lies_in_its_interval_and_among_the_values(values: list[float], q: float, clusters: int) -> None:
-    array = np.array(values)
-    value, low, high = quantile_interval(array, np.arange(len(array)) % clusters, q)
-    assert low <= value <= high
-    assert array.min() <= low
-    assert high <= array.max()
-
-
-def test_the_interval_of_a_quantile_grows_with_fewer_towns() -> None:
-    town = np.repeat(np.arange(20), 10)
-    values = town + np.random.default_rng(0).random(200)
-    one = quantile_interval(values, np.arange(200), 0.5)
-    other = quantile_interval(values, town, 0.5)
-    assert other[2] - other[1] > 2 * (one[2] - one[1])
 
 
 def test_a_calibration_finds_the_share_that_was_right() -> None:

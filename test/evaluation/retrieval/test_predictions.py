@@ -126,7 +126,7 @@ def test_an_encoder_that_knows_the_place_is_always_right(tmp_path: Path) -> None
     towns = town_set(ground=30)
     for name, made in predict(towns, Oracle(), tmp_path, Plan()).items():
         scores = score(made, towns)
-        assert all(figure.share.value == 1.0 for figure in scores.overall.figures), name
+        assert all(figure.share.value == 1.0 for figure in scores.overall.recalls), name
         assert (np.diff(made.distances, axis=1) >= 0).all()
 
 
@@ -134,8 +134,8 @@ def test_an_encoder_that_draws_by_lot_reaches_what_chance_says(tmp_path: Path) -
     towns = town_set(towns=12, queries=1500)
     (made,) = predict(towns, Lot(), tmp_path, Plan(settings=("aerial",), headings=("aligned",))).values()
     scores = score(made, towns)
-    for figure in scores.overall.figures:
-        sigma = np.sqrt(figure.chance * (1 - figure.chance) / figure.queries)
+    for figure in scores.overall.recalls:
+        sigma = np.sqrt(figure.chance * (1 - figure.chance) / scores.overall.counted[figure.radius_m])
         assert abs(figure.share.value - figure.chance) < 4 * sigma + 1e-9, figure
     curve = scores.curves[0]
     assert np.abs(curve.recall - curve.chance).max() < 0.05
@@ -146,7 +146,7 @@ def test_a_query_of_unknown_heading_is_found_where_one_of_its_headings_fits(tmp_
     plan = Plan(settings=("aerial",), query_headings=(1, 2, 8), invariant=False)
     made = predict(towns, Compass(), tmp_path, plan)
     assert sorted(made) == ["aerial_aligned", "aerial_random", "aerial_random_2-nearest", "aerial_random_8-nearest"]
-    recall = {name: score(each, towns).overall.figure("R@1", 25.0).share.value for name, each in made.items()}
+    recall = {name: score(each, towns).overall.recall("R@1", 25.0).share.value for name, each in made.items()}
     assert recall["aerial_aligned"] == recall["aerial_random_8-nearest"] == 1.0
     # One query in seven looks south, where the second of two headings fits; none looks north.
     assert recall["aerial_random"] < 0.05
@@ -168,7 +168,7 @@ def test_aligned_datasets_are_turned_by_lot_for_the_random_heading(tmp_path: Pat
         queries = dataclasses.replace(unknown, heading_rad=np.full(len(unknown), heading))
         made = predict(dataclasses.replace(towns, queries=queries), Compass(), tmp_path)
         aligned, random = (
-            score(made[name], dataclasses.replace(towns, queries=queries)).overall.figure("R@1", 25.0).share.value
+            score(made[name], dataclasses.replace(towns, queries=queries)).overall.recall("R@1", 25.0).share.value
             for name in ("aerial_aligned", "aerial_random")
         )
         assert aligned == 1.0
@@ -232,7 +232,7 @@ def test_a_distance_of_ones_own_is_used() -> None:
 def test_a_distance_of_ones_own_goes_through_the_whole_protocol(tmp_path: Path) -> None:
     towns = town_set(queries=50, ground=20)
     for each in predict(towns, Measured(), tmp_path, Plan(query_headings=(2,))).values():
-        assert score(each, towns).overall.figure("R@1", 25.0).share.value == 1.0
+        assert score(each, towns).overall.recall("R@1", 25.0).share.value == 1.0
 
 
 def test_enough_answers_are_kept_for_one_per_cent(tmp_path: Path) -> None:

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
-from crossloc3d_ros.evaluation.recall import chance_of_hit
 from crossloc3d_ros.evaluation.retrieval.predictions import About, Predictions
 from crossloc3d_ros.evaluation.retrieval.results import as_csv, as_json, headline
 from crossloc3d_ros.evaluation.retrieval.scores import (
     Scores,
-    chance_curve,
-    clusters_of,
     difference,
     places_within,
     score,
-    share_of,
 )
 
 
@@ -48,7 +44,9 @@ def test_hits_are_counted_by_distance_rank_and_town(line: EvaluationSet) -> None
     # The first answer of query 0 is 80 m off, the second right; query 1: in the other town, then 40 m off; query 2:
     # right at once. Query 3 has no submap within 100 m and does not count.
     scores = score(made(line, [[2, 0], [19, 8], [10, 11], [19, 18]]), line)
-    values = {(f.label, f.radius_m): (f.share.value, f.queries) for f in scores.overall.figures}
+    values = {
+        (f.label, f.radius_m): (f.share.value, scores.overall.counted[f.radius_m]) for f in scores.overall.recalls
+    }
     assert values["R@1", 100.0] == (pytest.approx(2 / 3), 3)
     assert values["R@5", 100.0] == (1.0, 3)
     assert values["R@1", 25.0] == (pytest.approx(1 / 3), 3)
@@ -58,71 +56,25 @@ def test_hits_are_counted_by_distance_rank_and_town(line: EvaluationSet) -> None
     assert [curve.recall[0] for curve in scores.curves] == pytest.approx([2 / 3, 1 / 3, 1 / 3])
     assert scores.curves[2].recall[1] == pytest.approx(2 / 3)
     by_name = {group.name: group for group in (*scores.groups, *scores.families, *scores.areas)}
-    assert by_name["a"].figure("R@1", 100.0).share.value == 1.0
-    assert by_name["b"].figure("R@1", 100.0).share.value == 0.5
+    assert by_name["a"].recall("R@1", 100.0).share.value == 1.0
+    assert by_name["b"].recall("R@1", 100.0).share.value == 0.5
     assert by_name["one"].queries == by_name["campus"].queries == 2
-    assert by_name["wood"].figure("R@1", 25.0).share.value == 1.0
+    assert by_name["wood"].recall("R@1", 25.0).share.value == 1.0
     with pytest.raises(KeyError):
-        scores.overall.figure("R@3", 100.0)
+        scores.overall.recall("R@3", 100.0)
 
 
 def test_one_per_cent_is_a_rank_of_the_database(line: EvaluationSet) -> None:
     many = dataclasses.replace(line, aerial=places([(10.0 * i, 0.0) for i in range(400)], [0] * 200 + [1] * 200))
     ids = [[399, 398, 397, 0], [399] * 4, [0] * 4, [0] * 4]
-    figures = {f.label: f for f in score(made(many, ids), many).overall.figures if f.radius_m == 25.0}
+    figures = {f.label: f for f in score(made(many, ids), many).overall.recalls if f.radius_m == 25.0}
     assert figures["R@1%"].rank == 4
     assert figures["R@1%"].share.value > figures["R@1"].share.value
-
-
-def test_chance_is_that_of_lots_without_replacement() -> None:
-    within = np.array([1, 3, 3, 8])
-    curve = chance_curve(within, 20, 12)
-    for rank in (1, 5, 12):
-        assert curve[rank - 1] == pytest.approx(chance_of_hit(within, 20, rank).mean())
-    rng = np.random.default_rng(0)
-    drawn = np.array([rng.permutation(20)[:5] for _ in range(20_000)])
-    simulated = np.mean([(drawn < count).any(axis=1).mean() for count in within])
-    assert curve[4] == pytest.approx(simulated, abs=0.005)
-    assert chance_curve(np.array([2]), 3, 5).tolist() == pytest.approx([2 / 3, 1.0, 1.0, 1.0, 1.0])
-    assert np.isnan(chance_curve(np.zeros(0, np.int64), 20, 3)).all()
 
 
 def test_places_within_are_those_of_the_same_town(line: EvaluationSet) -> None:
     assert places_within(line.queries, line.aerial, 100.0).tolist() == [3, 3, 3, 0]
     assert places_within(line.queries, line.aerial, 40.0).tolist() == [2, 2, 2, 0]
-
-
-def test_an_interval_counts_towns_and_not_queries() -> None:
-    towns = np.repeat(np.arange(10), 100)
-    all_or_nothing = share_of(towns < 5, towns, 1000)
-    assert all_or_nothing.value == 0.5
-    assert all_or_nothing.low < 0.25
-    assert all_or_nothing.high > 0.75
-    mixed = share_of(np.arange(1000) % 2 == 0, towns, 1000)
-    assert 0.46 < mixed.low < 0.5 < mixed.high < 0.54
-
-
-def test_an_interval_of_nothing_but_hits_has_a_width() -> None:
-    share = share_of(np.ones(50, np.bool_), np.repeat(np.arange(10), 5), 50)
-    assert (share.value, share.high) == (1.0, 1.0)
-    assert 0.9 < share.low < 0.95
-
-
-def test_intervals_cover_the_truth_about_as_often_as_they_say() -> None:
-    rng = np.random.default_rng(0)
-    covered = 0
-    for _ in range(200):
-        chance = np.clip(rng.normal(0.6, 0.15, 20), 0, 1)  # towns differ
-        towns = np.repeat(np.arange(20), 40)
-        share = share_of(rng.random(800) < chance[towns], towns, 800)
-        covered += share.low <= 0.6 <= share.high
-    assert 0.88 <= covered / 200 <= 0.99
-
-
-def test_few_towns_are_divided_into_squares(line: EvaluationSet) -> None:
-    assert len(set(clusters_of(line.queries).tolist())) == 4  # both ends of two towns
-    many = places([(0.0, 0.0), (500.0, 0.0)] * 9, [i // 2 for i in range(18)])
-    assert len(set(clusters_of(many).tolist())) == 9
 
 
 def test_the_difference_of_two_methods_is_that_of_the_same_queries() -> None:
@@ -145,7 +97,7 @@ def test_the_difference_of_two_methods_is_that_of_the_same_queries() -> None:
     assert ahead.value == pytest.approx(0.1, abs=0.04)
     assert 0.0 < ahead.low < ahead.high < 0.2
     assert difference(worse, worse, evaluation_set).value == 0.0
-    single = score(better, evaluation_set).overall.figure("R@1", 100.0).share
+    single = score(better, evaluation_set).overall.recall("R@1", 100.0).share
     assert single.high - single.low > 2 * (ahead.high - ahead.low)
     with pytest.raises(ValueError, match="settings"):
         difference(better, dataclasses.replace(worse, about=dataclasses.replace(worse.about, setting="aerial+ground")),

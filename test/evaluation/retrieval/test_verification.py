@@ -87,9 +87,9 @@ def retrieved(towns: EvaluationSet, seed: int = 5) -> Predictions:
 def test_the_right_place_comes_first_with_its_heading(towns: EvaluationSet) -> None:
     before = retrieved(towns)
     after = verify(before, towns, Calibrated(), CONFIG)
-    assert score(before, towns).overall.figure("R@1", 25.0).share.value < 0.5
+    assert score(before, towns).overall.recall("R@1", 25.0).share.value < 0.5
     scores = score(after, towns)
-    assert scores.overall.figure("R@1", 25.0).share.value == 1.0
+    assert scores.overall.recall("R@1", 25.0).share.value == 1.0
     assert scores.heading is not None
     assert scores.heading.queries == QUERIES
     assert scores.heading.median_deg < 6.0
@@ -181,7 +181,7 @@ def test_an_aligned_query_fits_without_a_turn(towns: EvaluationSet) -> None:
     before = retrieved(towns)
     aligned = dataclasses.replace(before, about=dataclasses.replace(before.about, heading="aligned"))
     after = verify(aligned, towns, Calibrated(), CONFIG)
-    assert score(after, towns).overall.figure("R@1", 25.0).share.value == 1.0
+    assert score(after, towns).overall.recall("R@1", 25.0).share.value == 1.0
     assert after.fit_headings_rad is not None
     assert np.abs(np.angle(np.exp(1j * after.fit_headings_rad[:, 0]))).max() <= math.radians(6.0) + 1e-5
 
