@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from crossloc3d_ros.clouds.filters import levelling_matrix
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.decision import Belief
 from crossloc3d_ros.localization.retrieval.place_belief import PlaceBelief
+from crossloc3d_ros.stopwatch import Stopwatch
 from crossloc3d_ros.types import (
     AlignedPoses,
     Candidates,
@@ -29,17 +29,15 @@ HEIGHT_STD_M, TILT_STD_RAD = 0.5, math.radians(2.0)
 
 
 class Watch:
-    """A stopwatch of the steps, milliseconds."""
+    """The times of the steps of one scan."""
 
     def __init__(self) -> None:
         self.timings = Timings()
-        self._since = time.perf_counter()
+        self._stopwatch = Stopwatch()
 
     def lap(self, name: str) -> None:
         """Note the time since the last lap as that of the step `name`, a field of `Timings`."""
-        now = time.perf_counter()
-        self.timings = dataclasses.replace(self.timings, **{name: 1e3 * (now - self._since)})
-        self._since = now
+        self.timings = dataclasses.replace(self.timings, **{name: 1e3 * self._stopwatch.lap()})
 
 
 def no_estimate(

@@ -150,7 +150,7 @@ def test_no_estimate_tells_no_number() -> None:
 
 def test_the_watch_notes_each_lap_once(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([1.0, 1.5, 1.75])
-    monkeypatch.setattr("crossloc3d_ros.localization.estimates.time.perf_counter", lambda: next(times))
+    monkeypatch.setattr("crossloc3d_ros.stopwatch.time.perf_counter", lambda: next(times))
     watch = Watch()
     watch.lap("prepare_ms")
     watch.lap("align_ms")

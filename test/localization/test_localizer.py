@@ -331,6 +331,19 @@ def test_switched_off_there_are_places_but_no_poses(town: tuple[PoseSet, AerialM
     assert estimate.timings.align_ms == 0.0
 
 
+def test_one_thread_stays_one_also_with_other_settings(
+    town: tuple[PoseSet, AerialMap, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a thread is started")
+
+    config = LocalizerConfig(alignment=AlignmentConfig(scope="none"))
+    localizer = Localizer(town[1], town[2], config, threads=1)
+    localizer.reconfigure(LocalizerConfig(alignment=AlignmentConfig(scope="auto")))
+    monkeypatch.setattr("crossloc3d_ros.localization.alignment.thread_pool.ThreadPoolExecutor", refuse)
+    assert len(seen(localizer, town[0].scans[0]).aligned)
+
+
 def test_a_pose_is_that_at_the_stamp_not_in_the_middle_of_the_turn(town: tuple[PoseSet, AerialMap, Any]) -> None:
     scan, later_ns = town[0].scans[0], STAMP_NS + 500_000_000
     motion = Motion(np.array([1.0, 0.2, 0.1]), np.diag([0.1, 0.1, 0.01]))
