@@ -14,14 +14,23 @@ from crossloc3d_ros.errors import MapError
 
 
 def descriptors(count: int = 500, size: int = 16, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(count, size)).astype(np.float32)
+    """Return whole numbers: float32 holds their squared distances exactly, however they are summed."""
+    return np.random.default_rng(seed).integers(-500, 501, (count, size)).astype(np.float32)
+
+
+def without_equals(stored: np.ndarray) -> np.ndarray:
+    """Return 30 queries of which none is equally far from two of the stored descriptors."""
+    queries = descriptors(30, seed=6)
+    squares = ((queries[:, None].astype(np.float64) - stored) ** 2).sum(axis=2)
+    assert squares.max() < 1 << 24 and np.diff(np.sort(squares, axis=1), axis=1).min() >= 1
+    return queries
 
 
 @pytest.mark.parametrize("k", [1, 5, 500])
 def test_neighbours_are_those_of_a_full_comparison(k: int) -> None:
-    stored, queries = descriptors(), descriptors(20, seed=1)
+    stored = descriptors()
     index = DescriptorMap(stored)
-    for query in queries:
+    for query in without_equals(stored):
         ids, distances = index.search(query, k)
         true = np.linalg.norm(stored.astype(np.float64) - query, axis=1)
         np.testing.assert_array_equal(ids, np.argsort(true, kind="stable")[:k])
@@ -29,7 +38,8 @@ def test_neighbours_are_those_of_a_full_comparison(k: int) -> None:
 
 
 def test_many_queries_are_answered_as_each_alone() -> None:
-    index, queries = DescriptorMap(descriptors()), descriptors(30, seed=1)
+    stored = descriptors()
+    index, queries = DescriptorMap(stored), without_equals(stored)
     ids, distances = index.search_many(queries, 7)
     for row, query in enumerate(queries):
         alone_ids, alone_distances = index.search(query, 7)

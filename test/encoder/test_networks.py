@@ -127,7 +127,8 @@ def test_weights_survive_the_disk_and_serve_an_encoder(name: str, tmp_path: Path
     assert checkpoint.fingerprint == fingerprint(network, PreprocessingConfig())
     points = cloud(300, 1)
     expected = describe(network, [points])[0]
-    assert np.array_equal(describe(checkpoint.model, [points])[0], expected)
+    # The fingerprint holds the weights to the bit; products may round otherwise where weights lie elsewhere in memory.
+    assert np.abs(describe(checkpoint.model, [points])[0] - expected).max() < 1e-5 * np.abs(expected).max()
     encoder = load_encoder(path)
     assert encoder.model_config.network == name
     assert np.abs(encoder.encode(points.numpy()) - expected).max() < 1e-4 * np.abs(expected).max()

@@ -205,17 +205,20 @@ def test_the_order_of_places_does_not_matter(tmp_path: Path) -> None:
 
 
 def test_searching_in_blocks_is_searching_one_by_one() -> None:
-    rng = np.random.default_rng(1)
-    database, queries = rng.normal(size=(300, 8)), rng.normal(size=(70, 3, 8))
-    database, queries = database.astype(np.float32), queries.astype(np.float32)
-    index = DescriptorMap(database)
+    """Whole numbers: float32 holds their squared distances exactly, however they are summed, and none are equal."""
+    rng = np.random.default_rng(0)
+    database, queries = rng.integers(-700, 701, (300, 8)), rng.integers(-700, 701, (70, 3, 8))
+    squares = ((queries[:, :, None] - database[None, None]) ** 2).sum(axis=3)
+    assert squares.max() < 1 << 24 and np.diff(np.sort(squares, axis=1)[:, :2], axis=1).min() > 0
+    brute = squares.min(axis=1)
+    assert np.diff(np.sort(brute, axis=1)[:, :21], axis=1).min() > 0
+    index, queries = DescriptorMap(database.astype(np.float32)), queries.astype(np.float32)
     ids, distances, numbers = nearest(index, queries, 20)
     for row in range(len(queries)):
         one = search_headings(index, queries[row], 20)
         np.testing.assert_array_equal(ids[row], one[0])
         np.testing.assert_allclose(distances[row], one[1], rtol=1e-4)
         np.testing.assert_array_equal(numbers[row], one[2])
-    brute = np.linalg.norm(queries[:, :, None] - database[None, None], axis=3).min(axis=1)
     np.testing.assert_array_equal(ids, np.argsort(brute, axis=1)[:, :20])
 
 
