@@ -34,7 +34,7 @@ __all__ = ["Localizer", "no_estimate"]
 
 
 class Localizer:
-    """Tell where on an aerial map a LiDAR is, scan after scan, without an initial pose."""
+    """Localize a LiDAR on an aerial map, scan after scan, without an initial pose."""
 
     def __init__(
         self, aerial_map: AerialMap, encoder: DescriptorEncoder, config: LocalizerConfig, *, threads: int = 0
@@ -45,14 +45,11 @@ class Localizer:
         """
         self.aerial_map = aerial_map
         self.encoder = encoder
-        self.config = config
-        self.calibration = effective_calibration(config.retrieval, encoder)
         self._threads = threads
-        self._aligner = (
-            None if config.alignment.scope == "none" else Aligner(aerial_map, config.alignment, threads=threads)
-        )
+        self._aligner: Aligner | None = None
         self._tracker = Tracker(config.fusion)
         self._schedule = SearchSchedule(config.alignment)
+        self.reconfigure(config)
 
     @property
     def stamp_ns(self) -> int | None:
@@ -70,7 +67,7 @@ class Localizer:
 
         `gravity_base` (3,) is the unit vector that points up, measured in the base frame, where an IMU gives one;
         `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it. `motion` leads from the
-        last scan that counted (`stamp_ns` of this object) to this one; None = not known. A function is asked for it
+        last scan that counted (`stamp_ns` of this object) to this one; None = not known. A function is called for it
         when the descriptor is done: odometry may arrive later than the scan.
         """
         watch = Watch()
@@ -83,30 +80,21 @@ class Localizer:
         descriptors = encode_query(self.encoder, prepared.patch.points)
         watch.lap("encode_ms")
         found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
-        candidates = _first(found, self.config.top_k)
-        place = decide(candidates, self.aerial_map.frame.to_enu(candidates.grid), self.config.retrieval)
+        candidates, frame = _first(found, self.config.top_k), self.aerial_map.frame
+        place = decide(candidates, frame.to_enu(candidates.grid), self.config.retrieval)
         watch.lap("search_ms")
         if self._aligner is None:
-            return placed_estimate(scan.stamp_ns, self.aerial_map.frame, place, candidates, prepared.counts, watch)
+            return placed_estimate(scan.stamp_ns, frame, place, candidates, prepared.counts, watch)
         motion = motion() if callable(motion) else motion
-        step = self._within_turn(scan.stamp_ns, motion)
+        step = self._within_revolution(scan.stamp_ns, motion)
         hypotheses = self._tracker.predict(scan.stamp_ns, motion)
-        aligned = self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses)
-        aligned = moved(aligned, step)
+        aligned = moved(self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses), step)
         watch.lap("align_ms")
         belief = self._tracker.update(aligned)
         self._schedule.state = belief.state
         watch.lap("fuse_ms")
         return posed_estimate(
-            scan.stamp_ns,
-            self.aerial_map.frame,
-            place,
-            candidates,
-            aligned,
-            belief,
-            gravity_base,
-            prepared.counts,
-            watch,
+            scan.stamp_ns, frame, place, candidates, aligned, belief, gravity_base, prepared.counts, watch
         )
 
     def set_prior(self, prior: PosePrior) -> None:
@@ -162,7 +150,7 @@ class Localizer:
         found: Candidates,
         hypotheses: Hypotheses,
     ) -> AlignedPoses:
-        """Align at the hypotheses, and as often as is due around the candidates and everywhere."""
+        """Align at the hypotheses; around the candidates and on the whole map when a search is due."""
         config, schedule = self.config.alignment, self._schedule
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
         alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
@@ -170,16 +158,16 @@ class Localizer:
             return no_aligned_poses()
         alignment.refine_hypotheses(hypotheses)
         if not self._tracker.skips:
-            if schedule.around(stamp_ns) and config.scope != "map":
+            if schedule.candidates_due(stamp_ns) and config.scope != "map":
                 alignment.search_candidates()
             if aligner.searches_map:
                 is_enough = config.scope == "auto" and alignment.is_sufficient()
-                if not is_enough and schedule.everywhere(stamp_ns):
+                if not is_enough and schedule.map_due(stamp_ns):
                     alignment.search_map()
         return alignment.result()
 
-    def _within_turn(self, stamp_ns: int, motion: Motion | None) -> Float64Array:
-        """Return the way (3,) from the middle of the lidar's turn, of which the scan tells, to its stamp."""
+    def _within_revolution(self, stamp_ns: int, motion: Motion | None) -> Float64Array:
+        """Return the motion (3,) from the middle of the lidar's revolution, where the scan is aligned, to its stamp."""
         since = self._tracker.stamp_ns
         if motion is None or not motion.is_known or since is None or stamp_ns <= since:
             return np.zeros(3)
@@ -203,29 +191,26 @@ class SearchSchedule:
         self.state = TrackState.SEARCHING
         self._last_ns: dict[str, int] = {}
 
-    def around(self, stamp_ns: int) -> bool:
-        """Return whether the candidates' surroundings are due; then they are taken as looked at."""
-        is_localized = self.state is TrackState.LOCALIZED
-        return self._due(
-            "around",
-            stamp_ns,
-            self._config.candidates_period_localized_s if is_localized else self._config.candidates_period_s,
-        )
+    def candidates_due(self, stamp_ns: int) -> bool:
+        """Return whether a search around the candidates is due; if so, it counts as done."""
+        config, is_localized = self._config, self.state is TrackState.LOCALIZED
+        period_s = config.candidates_period_localized_s if is_localized else config.candidates_period_s
+        return self._due("candidates", stamp_ns, period_s)
 
-    def everywhere(self, stamp_ns: int) -> bool:
-        """Return whether the whole map is due; then it is taken as looked at."""
-        return self._due("everywhere", stamp_ns, self._config.map_period_s)
+    def map_due(self, stamp_ns: int) -> bool:
+        """Return whether a search of the whole map is due; if so, it counts as done."""
+        return self._due("map", stamp_ns, self._config.map_period_s)
 
-    def _due(self, which: str, stamp_ns: int, every_s: float) -> bool:
+    def _due(self, which: str, stamp_ns: int, period_s: float) -> bool:
         last_ns = self._last_ns.get(which)
-        due = last_ns is None or not 0 <= stamp_ns - last_ns < round(every_s * 1e9)
+        due = last_ns is None or not 0 <= stamp_ns - last_ns < round(period_s * 1e9)
         if due:
             self._last_ns[which] = stamp_ns
         return due
 
 
 def _first(candidates: Candidates, count: int) -> Candidates:
-    """Return the first `count` candidates; their shares of belief were taken among all."""
+    """Return the first `count` candidates; their probabilities are those among all."""
     return dataclasses.replace(
         candidates,
         **{item.name: getattr(candidates, item.name)[:count] for item in dataclasses.fields(candidates)},

@@ -366,17 +366,23 @@ def test_a_pose_is_that_at_the_stamp_not_in_the_middle_of_the_turn(town: tuple[P
 
 def test_looks_are_due_at_once_then_now_and_then() -> None:
     looks, second = SearchSchedule(AlignmentConfig()), 1_000_000_000
-    assert looks.around(0) and looks.everywhere(0)
-    assert [looks.around(t * second // 10) for t in range(1, 7)] == [False, False, False, False, True, False]
-    assert not looks.everywhere(second // 10)
+    assert looks.candidates_due(0) and looks.map_due(0)
+    assert [looks.candidates_due(t * second // 10) for t in range(1, 7)] == [False, False, False, False, True, False]
+    assert not looks.map_due(second // 10)
     looks.state = TrackState.LOCALIZED
-    assert [looks.around(6 * second // 10 + t * second // 4) for t in range(1, 6)] == [False, False, False, True, False]
-    assert not looks.everywhere(3 * second - 1)
-    assert looks.everywhere(3 * second)
-    assert looks.everywhere(second), "time went backwards"
+    assert [looks.candidates_due(6 * second // 10 + t * second // 4) for t in range(1, 6)] == [
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
+    assert not looks.map_due(3 * second - 1)
+    assert looks.map_due(3 * second)
+    assert looks.map_due(second), "time went backwards"
     looks.state = TrackState.LOST
-    assert looks.around(3 * second)
-    assert not looks.around(3 * second + second // 5)
+    assert looks.candidates_due(3 * second)
+    assert not looks.candidates_due(3 * second + second // 5)
     looks.reset()
     assert looks.state is TrackState.SEARCHING
-    assert looks.around(0) and looks.everywhere(0)
+    assert looks.candidates_due(0) and looks.map_due(0)
