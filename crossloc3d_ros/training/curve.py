@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
@@ -44,17 +45,7 @@ def curve_page(folder: Path, *, live: bool = False) -> str:
     last = steps[-1]
     end_h = max(entry["elapsed_s"] for entry in (*steps, *validations)) / 3600.0
     title = f"Training: {folder.resolve().name}"
-    facts = {
-        "step": f"{last['step']:,}",
-        "hours": f"{end_h:.2f}",
-        "budget": starts[-1].get("budget", "unknown"),
-        "loss": f"{last['loss']:.4f} ({config.loss})",
-        "learning rate": f"{last['rate']:.2e}",
-        "clouds a second": f"{last['samples_per_s']:.1f}",
-        "clouds": f"{last.get('clouds', 2 * config.pairs * last['step']):,}",
-        "resumed": f"{len(starts) - 1} times",
-        "machine": f"{starts[-1]['processor']}, accelerator: {starts[-1]['accelerator']}",
-    }
+    facts = _facts(config, starts, last, end_h)
     reload = f'<meta http-equiv="refresh" content="{_RELOAD_S}">' if live else ""
     body = "".join(
         [
@@ -74,6 +65,20 @@ def curve_page(folder: Path, *, live: bool = False) -> str:
         f'<meta name="color-scheme" content="light dark"><title>{escape(title)}</title>'
         f"<style>{_style()}</style></head><body><main>{body}</main></body></html>\n"
     )
+
+
+def _facts(config: TrainConfig, starts: list[dict[str, Any]], last: dict[str, Any], end_h: float) -> dict[str, str]:
+    return {
+        "step": f"{last['step']:,}",
+        "hours": f"{end_h:.2f}",
+        "budget": starts[-1].get("budget", "unknown"),
+        "loss": f"{last['loss']:.4f} ({config.loss})",
+        "learning rate": f"{last['rate']:.2e}",
+        "clouds a second": f"{last['samples_per_s']:.1f}",
+        "clouds": f"{last.get('clouds', 2 * config.pairs * last['step']):,}",
+        "resumed": f"{len(starts) - 1} times",
+        "machine": f"{starts[-1]['processor']}, accelerator: {starts[-1]['accelerator']}",
+    }
 
 
 def _style() -> str:
