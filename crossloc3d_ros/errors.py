@@ -14,7 +14,7 @@ class CloudError(CrossLocError):
 
 
 class PoseError(CrossLocError):
-    """A message that tells a pose, such as odometry or an initial pose, cannot be used as it is."""
+    """A message with a pose, such as odometry or an initial pose, cannot be used as it is."""
 
 
 class AerialDataError(CrossLocError):

@@ -85,13 +85,13 @@ def utm_crs_of(crs: str, x: float, y: float) -> CRS:
     longitude, latitude = _transformer(crs, _WGS84_3D).transform(x, y)
     if not (abs(longitude) <= 360.0 and abs(latitude) <= 90.0):
         raise AerialDataError(
-            f"the coordinates ({x:.7g}, {y:.7g}) do not fit the CRS {crs_name(crs)}; say the right one with --crs"
+            f"the coordinates ({x:.7g}, {y:.7g}) do not fit the CRS {crs_name(crs)}; set the right one with --crs"
         )
     return utm_crs_for((longitude + 180.0) % 360.0 - 180.0, latitude)
 
 
 def same_crs(first: str, second: str) -> bool:
-    """Say whether two texts name the same CRS."""
+    """Return whether two texts name the same CRS."""
     return first == second or bool(parse_crs(first).equals(parse_crs(second), ignore_axis_order=True))
 
 
@@ -165,7 +165,7 @@ class Projection:
         return result
 
     def _plausible(self, points: Float64Array) -> BoolArray:
-        """Say which points lie on the Earth at all: PROJ wraps absurd coordinates around it instead of refusing."""
+        """Return which points lie on the Earth at all: PROJ wraps absurd coordinates around it instead of refusing."""
         limit = np.array([360.0, 90.0]) if self._geographic else np.array([_FARTHEST_M, _FARTHEST_M]) / self._unit_m
         return np.asarray((np.abs(points[:, :2]) <= limit).all(axis=1))
 

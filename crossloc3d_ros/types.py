@@ -52,7 +52,7 @@ class AerialChunk:
     """Some points of an aerial survey, in the order of the file."""
 
     points: Float64Array
-    """(N, 3) easting, northing, height, metres; the CRS is said by whoever hands the chunk over."""
+    """(N, 3) easting, northing, height, metres; the CRS is the file's."""
     classification: UInt8Array
     """(N,) ASPRS classes; 2 ground, 6 building, 7 and 18 noise, 9 water."""
 
@@ -71,7 +71,7 @@ class Candidates:
     """(k, 3) easting, northing, ground height, metres, grid frame."""
     heading_rad: Float64Array = field(default_factory=lambda: np.empty(0))
     """(k,) the robot's heading that fits best, counter-clockwise from grid east, to half a step of the headings tried;
-    empty where the descriptor says nothing of it."""
+    empty where the descriptor does not give it."""
 
     def __len__(self) -> int:
         return len(self.submap_ids)
@@ -128,7 +128,7 @@ class Hypotheses:
 
 
 class TrackState(Enum):
-    """How far the robot knows where it is."""
+    """State of the localization."""
 
     SEARCHING = "searching"
     """The null hypothesis is likelier than all poses."""
@@ -176,7 +176,7 @@ class ScanCounts:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where the scan was taken, as far as it can be told."""
+    """Where the scan was taken, as far as it is known."""
 
     stamp_ns: int
     status: FixStatus
@@ -225,11 +225,11 @@ def no_hypotheses() -> Hypotheses:
 
 
 class DescriptorEncoder(Protocol):
-    """What turns patches into descriptors; `encoder.runtime.Encoder` is the one that ships."""
+    """An encoder of patches to descriptors; `encoder.runtime.Encoder` is the one that ships."""
 
     @property
     def fingerprint(self) -> str:
-        """Identify weights, model and preprocessing: a map answers only to the encoder that made it."""
+        """Identify weights, model and preprocessing: a map is used only with the encoder that made it."""
 
     @property
     def descriptor_size(self) -> int:
@@ -251,7 +251,7 @@ class DescriptorEncoder(Protocol):
 
 @runtime_checkable
 class CalibratedEncoder(Protocol):
-    """An encoder whose weights carry what distances between its descriptors mean."""
+    """An encoder whose weights hold a calibration of descriptor distances."""
 
     @property
     def calibration(self) -> CalibrationConfig | None:
@@ -260,7 +260,7 @@ class CalibratedEncoder(Protocol):
 
 @runtime_checkable
 class HeadingEncoder(Protocol):
-    """An encoder that says how a query's unknown heading is dealt with."""
+    """An encoder with its way to treat the unknown heading of a query."""
 
     @property
     def headings(self) -> int:
@@ -268,4 +268,4 @@ class HeadingEncoder(Protocol):
 
     @property
     def rotations(self) -> int:
-        """Return over how many turns, evenly over the circle, the descriptor of a heading is averaged; 1 = none."""
+        """Return over how many test-time rotations, evenly over the circle, a descriptor is averaged; 1 = none."""

@@ -194,7 +194,7 @@ def open_workers(
 ) -> Iterator[Workers]:
     """Give the requested workers; `folder` is where the work lies, and all of them must see it.
 
-    Without loader and encoder they do tasks that need none. Raises ConfigError where the cluster does not answer or
+    Without loader and encoder they do tasks that need none. Raises ConfigError where the cluster does not respond or
     does not see the folder.
     """
     if scheduler is not None:
@@ -268,7 +268,7 @@ def _dask_client(scheduler: str, folder: Path) -> Iterator[Any]:
     try:
         client = Client(scheduler, timeout=_ANSWER_WITHIN_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise ConfigError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+        raise ConfigError(f"no Dask scheduler responds at {scheduler}: {error}") from error
     try:
         seen = client.run(folder.is_dir)
         if not seen:

@@ -58,7 +58,7 @@ def mounting_matrix(mounting: MountingConfig) -> Float64Array:
 
 
 def levelling_matrix(up_base: npt.NDArray[np.floating]) -> Float64Array:
-    """Return the smallest rotation (4, 4) that turns the measured "up" (3,) of the base frame into +z.
+    """Return the smallest rotation (4, 4) that takes the measured "up" (3,) of the base frame to +z.
 
     The length of `up_base` does not matter: an accelerometer at rest measures about 9.8 m/s^2 upwards. Raises
     CloudError where it is not finite, or zero, or where the base would stand on its side.
@@ -71,7 +71,7 @@ def levelling_matrix(up_base: npt.NDArray[np.floating]) -> Float64Array:
         raise CloudError(f"gravity must be a finite vector with a length, got {up.tolist()}")
     x, y, z = up / length
     if z < 0.2:
-        raise CloudError(f"gravity says that the robot lies on its side: up is {np.round(up / length, 3).tolist()}")
+        raise CloudError(f"by the measured gravity the robot lies on its side: up is {np.round(up / length, 3).tolist()}")
     # Rodrigues about the axis up x z, written out: no case distinction at zero tilt.
     k = 1.0 / (1.0 + z)
     T = np.eye(4)

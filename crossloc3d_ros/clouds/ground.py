@@ -32,10 +32,10 @@ def scan_heights(points_base: Float32Array, sensor_height_m: float, *, reach_m: 
     """Return the heights (N,) float32 of a scan's points above the ground below them, metres.
 
     Points (N, 3): base frame, z up, the base standing on the ground at about z = 0, the sensor `sensor_height_m`
-    above it. The ground is modelled out to `reach_m` on either side and carried on beyond. NaN points get NaN.
+    above it. The ground is modelled out to `reach_m` on either side and extrapolated beyond. NaN points get NaN.
 
-    The ground is a plane through what looks like ground, plus a membrane that follows the rings where they touch it
-    and comes back to the plane where they do not. What looks like ground: the lowest points of flat cells, no higher
+    The ground is a plane through the ground points, plus a membrane that follows the rings where they touch it
+    and comes back to the plane where they do not. Ground points are the lowest points of flat cells, no higher
     above any other cell than the steepest road would lead, which keeps walls and car roofs out, and not far below the
     ground around, as canals and boats are. Every ray passes above the ground on its way to its point. With no usable
     point the ground is the plane z = 0.
@@ -75,7 +75,7 @@ def _heights_above_ground(points: Float32Array, sensor_height: float, cells: int
             ceiling[row, column] -= plane[0] * x + plane[1] * y + plane[2]
     ground = np.zeros((cells, cells), np.float32)
     _stretch(ground, target, flat, ceiling, 1.0)
-    # What lies well below the ground so far (a canal's wall, a boat, a cellar) says nothing about the road above it.
+    # What lies well below the ground so far (a canal's wall, a boat, a cellar) is no measurement of the road above it.
     for row in range(cells):
         for column in range(cells):
             if target[row, column] < ground[row, column] - np.float32(_DROP_M):
@@ -252,7 +252,7 @@ def _fit_plane(where: Float32Array, lowest: Float32Array, weight: Float32Array, 
                 count += 1
     pa, pb, pc = plane
     for scale in (2.0, 2.0, 2.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25):
-        xx, yy = 4.0, 4.0  # flat unless the rings say otherwise
+        xx, yy = 4.0, 4.0  # flat unless the rings show a slope
         n1 = 20.0
         xy, x1, y1, xz, yz, z1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(count):
@@ -372,7 +372,7 @@ def classify_ground(
     largest_window_m: float = 40.0,
     tolerance_m: float = 0.3,
 ) -> BoolArray:
-    """Return the mask (N,) of ground points in an aerial survey that carries no classes.
+    """Return the mask (N,) of ground points in an aerial survey without classes.
 
     Points (N, 3) easting, northing, height, metres. A progressive morphological filter after Zhang et al. (2003) and
     SMRF (Pingel et al. 2013): openings of the lowest-point raster with windows that grow up to `largest_window_m`

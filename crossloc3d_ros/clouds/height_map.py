@@ -1,13 +1,13 @@
 """How well a scan fits a submap, without learning: heights around both, compared in every heading and near the centre.
 
 A patch becomes a square raster of the greatest heights above the ground. To match, rasters are read in rings and
-sectors around a centre. Turning the robot moves the sectors on, so all headings come at once by the Fourier transform
+sectors around a centre. A rotation of the robot shifts the sectors, so all headings come at once by the Fourier transform
 along them; the scan is read around several centres, for the submap's centre is not where the robot stands. What fits
-best gives a distance, a heading and an offset. The idea is that of Scan Context (IROS 2018); what differs is owed to
-looking for a scan in a survey that was made from above:
+best gives a distance, a heading and an offset. The idea is that of Scan Context (IROS 2018); the differences come from
+retrieving a scan from a survey that was made from above:
 
 * Heights are cut off where a beam `top_deg` above the horizon passes: the survey sees the roof, the robot does not.
-* Only cells that the scan knows about count: those that it hit, and the free ones before the first hit of a sector.
+* Only cells that the scan observes count: those that it hit, and the free ones before the first hit of a sector.
   What lies behind a wall is unknown to the robot and known to the survey.
 * The distance is the root mean square difference of the heights' square roots over those cells: whether something
   stands there matters more than how high it is.
@@ -41,7 +41,7 @@ class Match(NamedTuple):
     distances: Float32Array
     """(Q, M) square roots of heights, in patch units; infinite for a scan without anything to go by."""
     headings_rad: Float64Array
-    """(Q, M) by how much the scan must be turned counter-clockwise to lie as the submap, in [0, 2 pi)."""
+    """(Q, M) the counter-clockwise rotation that takes the scan to the submap, in [0, 2 pi)."""
     offsets_m: Float64Array
     """(Q, M, 2) where the robot stands from the submap's centre, along the submap's axes."""
 
@@ -74,7 +74,7 @@ class HeightMatcher:
         return self.match_prepared(scans, self.prepare(submaps))
 
     def prepare(self, submaps: Float32Array) -> Complex64Array:
-        """Return what submaps (M, n, n) are compared by, (F, 2 rings, M): worth keeping for many scans."""
+        """Return what submaps (M, n, n) are compared by, (F, 2 rings, M), to be kept where many scans are compared."""
         maps = self._smoothed(self._polar(submaps, np.zeros((1, 2), np.float32))[:, 0])
         return _spectra(np.concatenate((maps, maps**2), axis=1))
 
@@ -130,9 +130,9 @@ class HeightMatcher:
 
 
 def known_cells(maps: Float32Array) -> Float32Array:
-    """Return (N, rings, sectors) 1 where a scan knows the height: a hit, or free before the sector's first hit."""
+    """Return (N, rings, sectors) 1 where a scan observes the height: a hit, or free before the sector's first hit."""
     hit = maps > 0
-    first = np.where(hit.any(axis=1), hit.argmax(axis=1), 0)  # a sector without a hit says nothing
+    first = np.where(hit.any(axis=1), hit.argmax(axis=1), 0)  # a sector without a hit observes nothing
     before = np.arange(maps.shape[1])[None, :, None] < first[:, None, :]
     return np.asarray(hit | before, np.float32)
 
@@ -171,8 +171,8 @@ def _polar_of_points(points: Float32Array, centres: Float32Array, rings: int, se
             x, y, z = points[i, 0] - centres[k, 0], points[i, 1] - centres[k, 1], points[i, 2]
             ring = int(np.sqrt(x * x + y * y) * rings)
             if ring < rings:
-                turn = np.arctan2(y, x) / (2.0 * np.pi)
-                sector = int(np.floor(turn * sectors)) % sectors
+                revolutions = np.arctan2(y, x) / (2.0 * np.pi)
+                sector = int(np.floor(revolutions * sectors)) % sectors
                 polar[k, ring, sector] = max(polar[k, ring, sector], z)
     return polar
 

@@ -162,18 +162,18 @@ def patch_of_cropped(
     return Patch(chosen / np.float32(half_extent_m), half_extent_m, available)
 
 
-def turn(points: Float32Array, angle_rad: float) -> Float32Array:
-    """Return points (n, 3) turned about z, counter-clockwise seen from above."""
+def rotate_about_z(points: Float32Array, angle_rad: float) -> Float32Array:
+    """Return points (n, 3) rotated about z, counter-clockwise seen from above."""
     cosine, sine = np.float32(math.cos(angle_rad)), np.float32(math.sin(angle_rad))
-    turned = np.empty_like(points)
-    turned[:, 0] = cosine * points[:, 0] - sine * points[:, 1]
-    turned[:, 1] = sine * points[:, 0] + cosine * points[:, 1]
-    turned[:, 2] = points[:, 2]
-    return turned
+    rotated = np.empty_like(points)
+    rotated[:, 0] = cosine * points[:, 0] - sine * points[:, 1]
+    rotated[:, 1] = sine * points[:, 0] + cosine * points[:, 1]
+    rotated[:, 2] = points[:, 2]
+    return rotated
 
 
 def _recentred(points: Float32Array, half_extent_m: float, config: PreprocessingConfig, origin: Origin) -> Float32Array:
-    """Move points onto the origin that the configuration asks for and crop what left the patch by it."""
+    """Move points onto the configured origin and crop what left the patch by it."""
     # Sums of a sorted column do not depend on the order of the points.
     mean = np.sort(points, axis=0).mean(axis=0, dtype=np.float64)
     middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2

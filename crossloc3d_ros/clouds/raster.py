@@ -57,7 +57,7 @@ def terrain_raster(points: Float64Array, ground_mask: BoolArray, bounds: Bounds,
     """Return the terrain of `bounds`: the mean height of each cell's ground points, holes filled smoothly.
 
     Points (N, 3) easting, northing, height; ground_mask (N,). Under buildings and over canals the heights at the
-    hole's rim are carried over it as a stretched membrane would. All NaN where there is no ground point at all.
+    hole's rim are continued over it as a stretched membrane would. All NaN where there is no ground point at all.
     """
     check_points(points)
     if np.shape(ground_mask) != (len(points),):

@@ -17,10 +17,10 @@ from crossloc3d_ros.types import Float32Array, Float64Array, Patch, Scan, ScanCo
 
 @dataclass(frozen=True, eq=False)
 class PreparedScan:
-    """What became of a scan."""
+    """A scan that was prepared for the encoder."""
 
     patch: Patch | None
-    """None where too little of the scan can be used; `reason` says why."""
+    """None where too little of the scan can be used; see `reason`."""
     counts: ScanCounts
     reason: str
     """Empty where there is a patch, else one sentence for people."""
@@ -40,7 +40,7 @@ def prepare_scan(
     gravity_base: npt.NDArray[np.floating] | None = None,
     T_base_lidar: Float64Array | None = None,
 ) -> PreparedScan:
-    """Turn a scan into its patch: x, y from the sensor along the robot's heading, z above the ground.
+    """Make the patch of a scan: x, y from the sensor along the robot's heading, z above the ground.
 
     Non-finite points, those nearer or farther from the sensor than `config` allows and those inside the robot's own
     body are left out. The rest is levelled by the mounting, `T_base_lidar` (4, 4) where one is given in place of the

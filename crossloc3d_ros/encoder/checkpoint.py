@@ -1,4 +1,4 @@
-"""Weights on disk: one safetensors file that carries the configuration of the model and of the preprocessing.
+"""Weights on disk: one safetensors file that holds the configuration of the model and of the preprocessing.
 
 Large tensors may be stored as float16; batch-norm statistics and everything small stay float32.
 """
@@ -101,7 +101,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         preprocessing = from_dict(PreprocessingConfig, json.loads(header["preprocessing"]))
         model = make_network(config)
     except (KeyError, json.JSONDecodeError, ConfigError) as error:
-        raise CheckpointError(f"{path} carries no usable configuration: {error}") from error
+        raise CheckpointError(f"{path} holds no usable configuration: {error}") from error
     expected = model.state_dict()
     missing, unknown = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
     if missing or unknown:
@@ -131,7 +131,7 @@ def fingerprint(model: Network, preprocessing: PreprocessingConfig) -> str:
 
 
 def _counted(config: T, default: T) -> dict[str, Any]:
-    """Return the settings that tell one encoder from another."""
+    """Return the settings that distinguish one encoder from another."""
     usual = to_dict(default)
     return {key: value for key, value in to_dict(config).items() if key in _ALWAYS_COUNTED or value != usual[key]}
 

@@ -1,7 +1,7 @@
 """The network of `model.py` once more, as the CPU runs it fastest: folded, compiled, one cloud at a time.
 
 Batch norms are folded into the weights before them, what depends on the weights alone is computed once, and each stage
-is one compiled kernel over a range of rows, so that a few threads share it. `model.py` says what is computed; the
+is one compiled kernel over a range of rows, so that a few threads share it. `model.py` defines what is computed; the
 tests hold the two together.
 """
 
@@ -80,7 +80,7 @@ class CompiledModel:
 
     @staticmethod
     def can_compile(model: CrossLoc3D) -> bool:
-        """Say whether every width of the model is a multiple of the vector width."""
+        """Return whether every width of the model is a multiple of the vector width."""
         config = model.config
         widths = [config.channels, config.fused_channels, config.clusters]
         if model.refinement is not None:

@@ -210,7 +210,7 @@ def gather_outer(x: Any, grad: Any, in_rows: Any, out_rows: Any, first: Any, out
     x (N, Cin) and grad (M, Cout) float32, C-contiguous; out (K, Cin, Cout); Cout a multiple of 16.
     """
     depth, width = x.shape[1], grad.shape[1]
-    turned = np.empty((depth, OUTER_BLOCK), np.float32)
+    transposed = np.empty((depth, OUTER_BLOCK), np.float32)
     gathered = np.empty((OUTER_BLOCK, width), np.float32)
     for k in range(len(first) - 1):
         target = out[k].ravel()
@@ -219,12 +219,12 @@ def gather_outer(x: Any, grad: Any, in_rows: Any, out_rows: Any, first: Any, out
             for p in range(count):
                 row = in_rows[start + p]
                 for c in range(depth):
-                    turned[c, p] = x[row, c]
+                    transposed[c, p] = x[row, c]
                 row = out_rows[start + p]
                 for c in range(width):
                     gathered[p, c] = grad[row, c]
             strided_product(
-                turned.ravel(),
+                transposed.ravel(),
                 0,
                 OUTER_BLOCK,
                 1,

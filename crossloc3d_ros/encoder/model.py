@@ -123,11 +123,11 @@ class SelectionBlock(nn.Module):
 
 
 class PositionEmbedding(nn.Module):
-    """Tell each voxel where it lies: waves of its coordinates -> Linear, zero at first.
+    """Embed the position of each voxel: waves of its coordinates -> Linear, zero at first.
 
-    Convolutions and pooling look the same wherever a thing stands; this is what lets a descriptor say "a wall ten
-    metres to the left". `radial` knows the distance from the centre and the height, which no turn about z changes;
-    `cartesian` knows x, y and z. Not in the published network.
+    Convolutions and pooling are invariant to translation; with the embedding a descriptor depends on where in the
+    patch a structure stands. `radial` embeds the distance from the centre and the height, which no rotation about z
+    changes; `cartesian` x, y and z. Not in the published network.
     """
 
     WAVES = (0.5, 1.0, 2.0, 4.0)

@@ -21,7 +21,7 @@ PUBLISHED = {
 def make_network(config: ModelConfig) -> Network:
     """Return the network that `config.network` names, with fresh weights; ConfigError where settings do not fit.
 
-    The competitors read `voxel_sizes[0]`, `channels` and `descriptor_size`, and what else their modules say.
+    The competitors read `voxel_sizes[0]`, `channels` and `descriptor_size`, and what else their modules name.
     """
     if config.network == "crossloc3d":
         return CrossLoc3D(config)

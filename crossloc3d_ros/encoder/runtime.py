@@ -52,7 +52,7 @@ class Encoder:
 
     @property
     def fingerprint(self) -> str:
-        """Identify weights, model and preprocessing: a map answers only to the encoder that made it."""
+        """Identify weights, model and preprocessing: a map is used only with the encoder that made it."""
         return self._fingerprint
 
     @property
@@ -67,12 +67,12 @@ class Encoder:
 
     @property
     def calibration(self) -> CalibrationConfig | None:
-        """Return what distances between the descriptors mean, as fitted after training; None where nobody did."""
+        """Return what distances between the descriptors mean, as fitted after training; None without a calibration."""
         return self._calibration
 
     @property
     def headings(self) -> int:
-        """Return in how many headings a query must be tried against submaps that look north; 1 = the heading is free.
+        """Return in how many headings a query must be tried against north-up submaps; 1 = the heading is free.
 
         Stored with the weights, because they were trained for it.
         """
@@ -80,9 +80,9 @@ class Encoder:
 
     @property
     def rotations(self) -> int:
-        """Return over how many turns a query's descriptor is averaged, where the heading is free.
+        """Return over how many test-time rotations a query's descriptor is averaged, where the heading is free.
 
-        What has learned not to mind the heading minds it a little: the mean over some turns minds it less. Stored
+        Learned invariance to the heading is not exact: the mean over some rotations is closer to it. Stored
         with the weights, because the calibration is that of the averaged descriptors.
         """
         return self._rotations
@@ -139,5 +139,5 @@ def _calibration(metadata: Mapping[str, str]) -> CalibrationConfig | None:
 def _count(metadata: Mapping[str, str], key: str) -> int:
     text = metadata.get(key, "1")
     if not text.isdecimal() or not 1 <= int(text) <= MAX_HEADINGS:
-        raise CheckpointError(f"the weights ask for {text!r} {key}, not for 1 to {MAX_HEADINGS}; export them again")
+        raise CheckpointError(f"the weights name {text!r} {key}, not 1 to {MAX_HEADINGS}; export them again")
     return int(text)

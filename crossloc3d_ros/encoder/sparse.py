@@ -1,6 +1,6 @@
 """Sparse convolution on voxel grids: the one module that chooses and owns the backend.
 
-On the CPU in float32 the compiled kernels of `kernels.py` do the work; elsewhere (CUDA, other number types, odd
+On the CPU in float32 the compiled kernels of `kernels.py` do the work; otherwise (CUDA, other number types, odd
 widths) plain torch operations do the same, pair list by pair list. Both have a backward pass.
 """
 
@@ -71,7 +71,7 @@ def voxelize(clouds: Sequence[Tensor], size: float) -> VoxelGrid:
     """Return the voxels that the points (n_i, 3) of each cloud fall into: `floor(x / size)`, without duplicates.
 
     The division is a float32 division by float32(size): multiplying by the inverse, or float64, puts up to some
-    percent of the points that lie on voxel borders elsewhere than the published network does.
+    percent of the points that lie on voxel borders in other voxels than the published network does.
     """
     counts = torch.tensor([len(cloud) for cloud in clouds])
     points = torch.cat([cloud[:, :3] for cloud in clouds]).to(torch.float32)
@@ -181,7 +181,7 @@ def _weight_gradient(x: Tensor, grad: Tensor, weight: Tensor, pairs: KernelMap) 
 
 
 def _is_compiled(x: Tensor, weight: Tensor) -> bool:
-    """Say whether the compiled kernels can do the work."""
+    """Return whether the compiled kernels can do the work."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and weight.shape[2] % kernels.COLUMNS == 0
 
 

@@ -22,7 +22,7 @@ _loose = njit(cache=True, nogil=True, boundscheck=False, fastmath={"contract", "
 
 _LOG2_E = np.float32(1.44269504)
 _LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-# Far below what a sum can tell from 0, and far enough above denormal numbers, which are slow.
+# Far below what changes a sum, and far enough above denormal numbers, which are slow.
 _LOWEST, _HIGHEST = np.float32(-60.0), np.float32(88.0)
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 _P0, _P1, _P2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
@@ -85,7 +85,7 @@ def dense_relu(x: Any, weights: Any, out: Any, begin: int, end: int) -> None:
 def convolve(
     x: Any, weights: Any, in_rows: Any, out_rows: Any, relu: bool, out: Any, first: Any, last: Any, begin: int, end: int
 ) -> None:
-    """Compute `out = out + convolution`, with a ReLU if asked, for one thread's pairs and output rows."""
+    """Compute `out = out + convolution`, with a ReLU where configured, for one thread's pairs and output rows."""
     gather_product(x, weights, in_rows, out_rows, first, last, out)
     if relu:
         _relu(out, begin, end)
@@ -285,14 +285,14 @@ def assign(x: Any, weights: Any, soft: Any, begin: int, end: int) -> None:
 def aggregate(x: Any, soft: Any, sums: Any, begin: int, end: int) -> None:
     """Add `x.T @ soft` to sums (C, K) for the channels [begin, end)."""
     n, clusters = soft.shape
-    turned = np.empty((end - begin, BLOCK), np.float32)
+    transposed = np.empty((end - begin, BLOCK), np.float32)
     for start in range(0, n, BLOCK):
         rows = min(BLOCK, n - start)
         for i in range(rows):
             for c in range(begin, end):
-                turned[c - begin, i] = x[start + i, c]
+                transposed[c - begin, i] = x[start + i, c]
         strided_product(
-            turned.ravel(),
+            transposed.ravel(),
             0,
             BLOCK,
             1,

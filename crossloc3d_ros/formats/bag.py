@@ -101,7 +101,7 @@ class BagReader:
     def __enter__(self) -> Self:
         _check_before_opening(self.path)
         try:
-            # Bags from before Iron carry no message definitions: the standard types are then taken as Jazzy's.
+            # Bags from before Iron hold no message definitions: the standard types are then taken as Jazzy's.
             reader = AnyReader([self.path], default_typestore=_jazzy())
             self._reader = self._stack.enter_context(reader)
         except Exception as error:  # a damaged file makes the library raise nearly anything
@@ -140,7 +140,7 @@ class BagReader:
         return topics[name]
 
     def only_topic(self, msgtype: str, how_to_choose: str) -> BagTopic:
-        """Return the one topic of a type; with none or several BagError lists them and says `how_to_choose`."""
+        """Return the one topic of a type; with none or several BagError lists them and adds `how_to_choose`."""
         topics = self.topics()
         fitting = [topic for topic in topics.values() if topic.msgtype == msgtype]
         if not fitting:
@@ -277,7 +277,7 @@ class BagWriter:
                 writer.close()
                 (self._folder / self.path.name).rename(self.path)
             else:
-                with suppress(*_DISK_ERRORS):  # what went wrong before is what matters
+                with suppress(*_DISK_ERRORS):  # the earlier error is the cause
                     writer.abort()
         except _DISK_ERRORS as failure:
             raise BagError(f"cannot write {self.path}: {failure}") from failure
@@ -314,7 +314,7 @@ class BagWriter:
 
 
 def stamp_ns_of(message: Any, recorded_ns: int) -> int:
-    """Return the header's stamp, or the time of recording for a message whose header carries none."""
+    """Return the header's stamp, or the time of recording for a message whose header has none."""
     stamp = message.header.stamp
     stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
     return stamp_ns or recorded_ns

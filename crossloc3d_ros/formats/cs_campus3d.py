@@ -38,7 +38,7 @@ class Preset:
     database: str
     queries: str
     aerial_m: float | None
-    """Metres of one unit of an aerial cloud; None: not known, or said by `dataset.json`."""
+    """Metres of one unit of an aerial cloud; None: unknown, or given in `dataset.json`."""
     ground_m: float | None
     """The same for a scan."""
     validation_database: str | None = None
@@ -118,7 +118,7 @@ class QueryTable:
 
 @dataclass(frozen=True, eq=False)
 class EvaluationTuples:
-    """Queries and the databases that they are looked for in."""
+    """Queries and the databases that they are retrieved from."""
 
     database: tuple[CloudTable, ...]
     queries: tuple[QueryTable, ...]
@@ -187,7 +187,7 @@ def read_training(folder: Path, preset: Preset) -> TrainingTuples:
 
 
 def read_evaluation(folder: Path, preset: Preset, *, validation: bool = False) -> EvaluationTuples:
-    """Return databases and queries of a dataset, of its validation area if asked for; raises as `read_training`."""
+    """Return databases and queries of a dataset, of its validation area with `validation`; raises as `read_training`."""
     names = (preset.validation_database, preset.validation_queries) if validation else (preset.database, preset.queries)
     if names[0] is None or names[1] is None:
         raise DatasetError(f"a dataset of the preset '{preset.name}' has no validation area of its own")
@@ -311,7 +311,7 @@ def _clouds(path: Path, entries: Sequence[Mapping[Any, Any]], preset: Preset) ->
             raise DatasetError(f"{path}: the position of '{file}' is not a number") from error
         files.append(file)
         places.append(place)
-    # The folders say it; those of CS-Campus3D's ground scans hold files that are called aerial, too.
+    # By the folders; those of CS-Campus3D's ground scans hold files that are called aerial, too.
     is_ground = np.array(
         [preset.name == "oxford" or any("ground" in part for part in PurePosixPath(f).parts) for f in files], np.bool_
     )

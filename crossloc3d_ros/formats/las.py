@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC files in and LAZ files out; the only module that knows laspy.
+"""LAS, LAZ and COPC files in and LAZ files out; the only module that imports laspy.
 
 Files are read in chunks, never whole. Coordinates come out in the file's own CRS and units: `geodesy.Projection` makes
 metres of them.
@@ -235,24 +235,24 @@ def _crs_of(path: Path, records: list[Any]) -> tuple[str, float | None]:
             try:
                 return crs_text(parse_crs(record.string.strip("\0 \n"))), None
             except AerialDataError as error:
-                raise AerialDataError(f"the header of {path}: {error}; say which it is with --crs") from error
+                raise AerialDataError(f"the header of {path}: {error}; set it with --crs") from error
     for record in records:
         if isinstance(record, GeoKeyDirectoryVlr):
             return _crs_of_geokeys(path, record)
-    raise AerialDataError(f"{path} does not say its CRS; say which it is with --crs, for instance --crs EPSG:28992")
+    raise AerialDataError(f"{path} names no CRS; set it with --crs, for instance --crs EPSG:28992")
 
 
 def _crs_of_geokeys(path: Path, record: GeoKeyDirectoryVlr) -> tuple[str, float | None]:
     keys = {int(k.id): int(k.value_offset) for k in record.geo_keys if k.tiff_tag_location == 0}
     horizontal = next((c for c in (keys.get(_PROJECTED_KEY), keys.get(_GEOGRAPHIC_KEY)) if _is_epsg(c)), None)
     if horizontal is None or keys.get(_PROJECTED_KEY, 0) == 32767:
-        raise AerialDataError(f"the header of {path} describes a CRS without an EPSG code; say which it is with --crs")
+        raise AerialDataError(f"the header of {path} describes a CRS without an EPSG code; set it with --crs")
     unit = _UNIT_METRES.get(keys.get(_VERTICAL_UNITS_KEY, 0))
     vertical = keys.get(_VERTICAL_KEY)
     try:
         crs = parse_crs(f"EPSG:{horizontal}")
     except AerialDataError as error:
-        raise AerialDataError(f"the header of {path}: {error}; say which it is with --crs") from error
+        raise AerialDataError(f"the header of {path}: {error}; set it with --crs") from error
     if vertical is None or not _is_epsg(vertical):
         return crs_text(crs), unit
     try:

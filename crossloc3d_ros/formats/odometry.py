@@ -1,4 +1,4 @@
-"""From the poses that messages carry to matrices; for messages of rclpy and of recordings alike."""
+"""From the poses of messages to matrices; for messages of rclpy and of recordings alike."""
 
 from __future__ import annotations
 

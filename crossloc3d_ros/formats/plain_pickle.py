@@ -1,7 +1,7 @@
 """Pickles of plain containers, numbers and texts, read without ever calling what a pickle names.
 
-Python's own unpickler calls whatever a pickle asks for. This one takes the pickle's instructions as data (`pickletools`
-parses them) and knows what the plain ones mean; everything else is refused by its name. Of numpy it knows the few names
+Python's own unpickler calls whatever a pickle names. This one takes the pickle's instructions as data (`pickletools`
+parses them) and executes the plain ones; everything else is refused by its name. Of numpy it admits the few names
 that numbers and arrays of numbers are pickled under, and makes these numbers itself.
 
 Lists of whole numbers come as arrays: the published training pickles hold some 400 million of them, which as Python
@@ -192,7 +192,7 @@ class _Machine:
             raise self._refused(f"the instruction {name}")
 
     def _push(self, name: str, argument: Any) -> bool:
-        """Carry out an instruction that puts a value on the stack or into the memo; return whether it is one."""
+        """Execute an instruction that puts a value on the stack or into the memo; return whether it is one."""
         stack = self._stack
         if name in _VALUES:
             stack.append(argument)
@@ -213,7 +213,7 @@ class _Machine:
         return True
 
     def _take_few(self, name: str) -> bool:
-        """Carry out an instruction that takes one to three values off the stack; return whether it is one."""
+        """Execute an instruction that takes one to three values off the stack; return whether it is one."""
         stack = self._stack
         if name in _TUPLES:
             items = stack[-_TUPLES[name] :]
@@ -233,7 +233,7 @@ class _Machine:
         return True
 
     def _take_group(self, name: str) -> bool:
-        """Carry out an instruction that takes all since the last mark; return whether it is one."""
+        """Execute an instruction that takes all since the last mark; return whether it is one."""
         stack = self._stack
         if name == "APPENDS":
             items = self._group(expand=False)
@@ -261,7 +261,7 @@ class _Machine:
         return True
 
     def _take_names(self, name: str, argument: Any) -> bool:
-        """Carry out an instruction on what a pickle names, calling nothing; return whether it is one."""
+        """Execute an instruction on what a pickle names, calling nothing; return whether it is one."""
         stack = self._stack
         if name == "GLOBAL":
             module, _, attribute = argument.partition(" ")
@@ -313,7 +313,7 @@ class _Machine:
         return _Name(_NAMES[module, attribute])
 
     def _made(self, function: Any, arguments: Any) -> Any:
-        """Return what a plain call would give, made here."""
+        """Return what a plain call would return, made here."""
         if not isinstance(function, _Name) or not isinstance(arguments, tuple):
             raise self._refused(f"a call of a {type(function).__name__}")
         meaning = function.meaning
@@ -340,7 +340,7 @@ class _Machine:
 
     def _refused(self, what: str) -> DatasetError:
         return DatasetError(
-            f"{self._path} is refused: it asks for {what}, and a dataset's pickle holds plain containers, numbers and "
+            f"{self._path} is refused: it holds {what}, and a dataset's pickle holds plain containers, numbers and "
             "texts alone; do not open it with anything else unless you trust who made it"
         )
 

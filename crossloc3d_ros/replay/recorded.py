@@ -55,7 +55,7 @@ def localize_bag(
     """Localize every `every`-th scan of a bag, write the estimates to the CSV file `output` and return their number.
 
     `imu_topic` levels the scans by accelerations in the axes of the base; `odometry` names what measures the motion
-    between them; None = nothing does. A cloud that cannot be used becomes a row without a fix that says why; a bag
+    between them; None = nothing does. A cloud that cannot be used becomes a row without a fix, with the reason; a bag
     that breaks off raises BagError when the rows before the break are written.
     """
     total = math.ceil(bag.topic(topic, POINT_CLOUD).count / every)
@@ -80,7 +80,7 @@ class _Waiting(NamedTuple):
     stamp_ns: int
     recorded_ns: int
     scan: PreparedInput | CloudError
-    """The error says why the cloud cannot be used."""
+    """The error is why the cloud cannot be used."""
 
 
 class _Feed:

@@ -46,7 +46,7 @@ def header_message(stamp_ns: int, frame_id: str) -> Header:
 
 
 def fix_message(estimate: Estimate, base_frame_id: str) -> NavSatFix:
-    """Return the fix of `base_frame_id`; without one the position is NaN, so that nobody drives by a guess."""
+    """Return the fix of `base_frame_id`; without one the position is NaN, so that it cannot be taken for a fix."""
     is_fix = estimate.status is FixStatus.FIX
     message = NavSatFix(
         header=header_message(estimate.stamp_ns, base_frame_id),
@@ -84,7 +84,7 @@ def origin_message(frame: MapFrame, stamp_ns: int, global_frame_id: str) -> NavS
 
 
 def pose_message(estimate: Estimate, global_frame_id: str) -> PoseWithCovarianceStamped:
-    """Return the pose in the map frame; where the orientation is unknown its variance says so."""
+    """Return the pose in the map frame; where the orientation is unknown its variance is large."""
     message = PoseWithCovarianceStamped(header=header_message(estimate.stamp_ns, global_frame_id))
     if np.isfinite(estimate.T_map_base).all():
         message.pose.pose = pose_of_matrix(estimate.T_map_base)
@@ -108,7 +108,7 @@ STATE_LEVELS: Mapping[TrackState, bytes] = {
 
 
 def state_values(estimate: Estimate) -> dict[str, str]:
-    """Return how far the robot knows where it is, as texts."""
+    """Return the state of localization as texts."""
     values = {
         "state": estimate.state.value,
         "fix": "yes" if estimate.status is FixStatus.FIX else "no",
@@ -122,7 +122,7 @@ def state_values(estimate: Estimate) -> dict[str, str]:
 
 
 def state_message(estimate: Estimate, name: str) -> DiagnosticStatus:
-    """Return state and reason; `stamp_ns` among the values says of which scan."""
+    """Return state and reason; `stamp_ns` among the values is that of the scan."""
     level = STATE_LEVELS[estimate.state]
     if estimate.status is not FixStatus.FIX:
         level = max(level, DiagnosticStatus.WARN)

@@ -1,4 +1,4 @@
-"""What the localizer says about itself on /diagnostics: counts, latencies, the last reason, and what it works with."""
+"""What the localizer reports on /diagnostics: counts, latencies, the last reason, and what it works with."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Statistics:
             self._dropped += count
 
     def lost(self, total: int) -> None:
-        """Note how many messages the middleware says it lost."""
+        """Record how many messages the middleware reports as lost."""
         with self._lock:
             self._lost = total
 
@@ -107,7 +107,7 @@ def worker_complaint(health: WorkerHealth, stall_s: float) -> str:
     return ""
 
 
-def judge_health(
+def health_status(
     snapshot: Snapshot, topic: str, publishers: int, complaint: str, odometry: str = ""
 ) -> tuple[bytes, str]:
     """Return level and message of an active localizer.
@@ -118,7 +118,7 @@ def judge_health(
         if complaint:
             return DiagnosticStatus.ERROR, complaint
         if publishers == 0:
-            return DiagnosticStatus.WARN, f"nobody publishes on {topic}"
+            return DiagnosticStatus.WARN, f"no publisher on {topic}"
         return DiagnosticStatus.WARN, f"no cloud on {topic} for {snapshot.silent_s:.0f} s ({publishers} publishers)"
     if snapshot.last is None:
         return DiagnosticStatus.OK, "waiting for the first result"

@@ -71,7 +71,7 @@ class ImuInput:
             self._warn(str(error))
 
     def state(self) -> str:
-        """Return the last acceleration that could be gravity, in words."""
+        """Return the last acceleration that could be gravity as a text."""
         if self._acceleration is None or time.monotonic() - self._heard_at > SILENCE_S:
             return "no recent sample"
         return f"acceleration {np.round(self._acceleration, 2).tolist()} m/s2 in base"
@@ -96,5 +96,5 @@ class ImuInput:
         std_rad, offset_rad = np.radians([self._config.imu_heading_std_deg, self._config.imu_heading_offset_deg])
         prior = heading_prior(message, R_base_imu, self._frame, float(std_rad), float(offset_rad))
         if prior is None:
-            raise PoseError("its messages carry no orientation")
+            raise PoseError("its messages have no orientation")
         self._on_heading(prior)

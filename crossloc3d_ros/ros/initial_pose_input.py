@@ -22,7 +22,7 @@ from crossloc3d_ros.types import Float64Array
 
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 TF_TIMEOUT_S = 3.0
-"""How long TF may take to relate a frame to the map: a listener that has just started knows nothing yet."""
+"""How long TF may take to relate a frame to the map: a listener that has just started has no transforms yet."""
 TF_PERIOD_S = 0.1
 
 

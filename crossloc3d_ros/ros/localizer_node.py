@@ -29,7 +29,7 @@ from crossloc3d_ros.ros.diagnostics import (
     SILENCE_S,
     Statistics,
     diagnostic_message,
-    judge_health,
+    health_status,
     snapshot_values,
     worker_complaint,
 )
@@ -286,7 +286,7 @@ class LocalizerNode(LifecycleNode):
     # Parameters and the service
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set the parameters, all or none; a refusal says which one and why."""
+        """Set the parameters, all or none; a refusal names the parameter and the reason."""
         try:
             admitted = self._configuration.admit(parameter_list)
         except ConfigError as error:
@@ -353,13 +353,13 @@ class LocalizerNode(LifecycleNode):
         if stall:
             self._report_stale(stall)
             return DiagnosticStatus.ERROR, stall
-        level, message = judge_health(snapshot, points, self.count_publishers(points), parts.lidar.complaint, complaint)
+        level, message = health_status(snapshot, points, self.count_publishers(points), parts.lidar.complaint, complaint)
         if snapshot.silent_s > SILENCE_S:
             self._report_stale(message)
         return level, message
 
     def _report_stale(self, reason: str) -> None:
-        """Say once, after the last scan, that the latched state is no longer current."""
+        """Report once, after the last scan, that the latched state is no longer current."""
         snapshot = self._statistics.snapshot()
         if self._parts is None or self._stale_after == snapshot.processed:
             return

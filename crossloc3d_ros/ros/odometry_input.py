@@ -149,4 +149,4 @@ def odometry_complaint(state: OdometryState, topic: str, publishers: int) -> str
         return f"odometry on {topic} has been silent for {state.silent_s:.0f} s"
     if publishers:
         return f"no odometry has come on {topic} ({publishers} publishers)"
-    return f"nobody publishes odometry on {topic}: remap odom, or set odometry to scan or none"
+    return f"no publisher of odometry on {topic}: remap odom, or set odometry to scan or none"

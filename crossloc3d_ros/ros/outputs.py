@@ -80,7 +80,7 @@ class Outputs:
                 publishers[name].publish(make(estimate, self._frame, config.global_frame_id))
 
     def publish_stale(self, state: TrackState, reason: str) -> None:
-        """Say on the latched topic that the last state is no longer current, and why."""
+        """Report on the latched topic that the last state is no longer current, and why."""
         self._publishers["state"].publish(stale_message(state, reason, self._status_name))
 
     def close(self) -> None:

@@ -41,7 +41,7 @@ class ConfigParameters(Generic[T]):
     """The parameters of a node that mirror one configuration dataclass, and that configuration as it stands now.
 
     The node must have been made with `automatically_declare_parameters_from_overrides=True`: that is how overrides
-    from files and command lines show that no field answers to, and they are refused.
+    from files and command lines show that belong to no field, and they are refused.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class ConfigParameters(Generic[T]):
     ) -> None:
         """Declare every field; raises ConfigError naming each override that is unknown or out of range.
 
-        `topics` are the fully qualified topics whose QoS may be overridden. `why_fixed(name)` says why a parameter
+        `topics` are the fully qualified topics whose QoS may be overridden. `why_fixed(name)` returns why a parameter
         cannot be changed now, or None; `on_change` is called after a change.
         """
         self._node = node
@@ -74,9 +74,9 @@ class ConfigParameters(Generic[T]):
         return from_dict(self._kind, _nested({name: self._value(name) for name in self._settings}))
 
     def admit(self, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Return the parameters as they can be set, integers turned into the floats that they are meant to be.
+        """Return the parameters as they can be set, integers converted to the floats that they are meant to be.
 
-        Raises ConfigError that names what is unknown or wrong; rclpy's own answer leaves the name out.
+        Raises ConfigError that names what is unknown or wrong; rclpy's own message leaves the name out.
         """
         for parameter in parameters:
             if parameter.name not in self._settings and not self._node.has_parameter(parameter.name):
@@ -116,7 +116,7 @@ class ConfigParameters(Generic[T]):
         for name, setting in self._settings.items():
             value = setting.default
             if name in overrides:
-                # Once more for its own sake: an integer is turned into the float that the field holds.
+                # Once more for its own sake: an integer is converted to the float that the field holds.
                 value = check_value(name, setting.hint, overrides[name], setting.metadata)
                 self._node.undeclare_parameter(name)
             self._node.declare_parameter(name, _ros(value), descriptor_of(setting), ignore_override=True)
@@ -125,7 +125,7 @@ class ConfigParameters(Generic[T]):
         return _plain(self._node.get_parameter(name).value)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        # Called for declarations too, of parameters that nobody knows yet.
+        # Called for declarations too, of parameters that do not exist yet.
         try:
             new = {parameter.name: parameter.value for parameter in map(self._admit, parameters)}
             values = {name: _plain(new[name]) if name in new else self._value(name) for name in self._settings}
@@ -150,7 +150,7 @@ def _ros(value: Any) -> Any:
 
 
 def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn dotted names into nested mappings."""
+    """Return dotted names as nested mappings."""
     nested: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, last = name.split(".")

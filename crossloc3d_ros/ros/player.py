@@ -101,12 +101,12 @@ class Player:
             if time.monotonic() > deadline:
                 waiting = ", ".join(p.topic_name for p in self._clouds) or "any of the topics"
                 raise CrossLocError(
-                    f"nobody subscribed to {waiting} within {self._config.wait_s:g} s; start the localizer with "
+                    f"no node subscribed to {waiting} within {self._config.wait_s:g} s; start the localizer with "
                     "'--ros-args -r points:=TOPIC', check that ROS_DOMAIN_ID is the same, or give --wait-s 0"
                 )
             self._tick(self._bag.start_ns)
             time.sleep(0.02)
-        # Discovery has two ends: that we know the subscriber does not mean that it knows us, and best effort loses
+        # Discovery has two ends: that we have discovered the subscriber does not mean that it has discovered us, and best effort loses
         # what comes before.
         settled = time.monotonic() + _SETTLE_S
         while time.monotonic() < settled:
@@ -141,7 +141,7 @@ class Player:
             while self._clock is not None and next_tick_ns <= due_ns:
                 _sleep_until(next_tick_ns)
                 self._tick(first_ns + round((next_tick_ns - begin_ns) * self._config.rate))
-                # After a stall one tick with the present time is worth more than a burst of old ones.
+                # After a stall one tick with the present time is better than a burst of old ones.
                 next_tick_ns = max(next_tick_ns + period_ns, time.monotonic_ns() - period_ns)
             _sleep_until(due_ns)
             published_ns = time.monotonic_ns()

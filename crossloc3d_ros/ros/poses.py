@@ -1,4 +1,4 @@
-"""Poses that messages tell: odometry, initial poses, an IMU's orientation. What cannot be used is refused, with why."""
+"""Poses from messages: odometry, initial poses, an IMU's orientation. What cannot be used is refused with a reason."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ OUTSIDE_M = 100.0
 """An initial pose may lie so far outside of the map: whoever points at its border means the border."""
 FARTHEST_M = 1e6
 LEAST_STD_M, LEAST_STD_RAD = 0.1, math.radians(0.5)
-UNSAID_STD_M, UNSAID_STD_RAD = 2.0, math.radians(20.0)
-"""Of a pose whose covariance is all zeros, which in ROS means that nobody has filled it in."""
+DEFAULT_STD_M, DEFAULT_STD_RAD = 2.0, math.radians(20.0)
+"""Of a pose whose covariance is all zeros, which in ROS means that it was not filled in."""
 UNKNOWN_STD_M, UNKNOWN_STD_RAD = 1e5, math.pi
 """What deviates by more is not known at all."""
 LEVEL_COSINE = 0.5
@@ -51,21 +51,21 @@ def initial_pose(
     if np.abs(T_map_base[:3, 3]).max() > FARTHEST_M:
         raise PoseError("it lies outside of the map, and of what a map can be")
     grid, heading = _in_grid(frame, T_map_base[:3, 3], yaw)
-    turn = heading - yaw
-    R = np.array([[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    c, s = math.cos(heading - yaw), math.sin(heading - yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     covariance = R @ covariance @ R.T
     west, south, east, north = bounds
     away = math.hypot(max(west - grid[0], 0.0, grid[0] - east), max(south - grid[1], 0.0, grid[1] - north))
-    knows_place = covariance[0, 0] + covariance[1, 1] < UNKNOWN_STD_M**2
-    knows_heading = covariance[2, 2] < UNKNOWN_STD_RAD**2
-    if knows_place and not away <= OUTSIDE_M:
+    has_position = covariance[0, 0] + covariance[1, 1] < UNKNOWN_STD_M**2
+    has_heading = covariance[2, 2] < UNKNOWN_STD_RAD**2
+    if has_position and not away <= OUTSIDE_M:
         raise PoseError(f"it lies {away:,.0f} m outside of the map")
-    if not knows_place and not knows_heading:
-        raise PoseError("its covariance says that neither place nor heading are known")
+    if not has_position and not has_heading:
+        raise PoseError("by its covariance neither position nor heading is known")
     return PosePrior(
-        grid=grid if knows_place else None,
-        heading_rad=heading if knows_heading else None,
-        covariance=_forgetting(covariance, knows_place, knows_heading),
+        grid=grid if has_position else None,
+        heading_rad=heading if has_heading else None,
+        covariance=_forgetting(covariance, has_position, has_heading),
         stamp_ns=stamp_ns,
     )
 
@@ -73,11 +73,11 @@ def initial_pose(
 def heading_prior(
     imu: Imu, R_base_imu: Float64Array, frame: MapFrame, std_rad: float, offset_rad: float
 ) -> PosePrior | None:
-    """Return the heading that an IMU's orientation tells, None where it says that it has none.
+    """Return the heading measured by an IMU's orientation; None where it has no orientation.
 
-    REP-145: the orientation turns the IMU's axes, whose directions on the base are `R_base_imu` (3, 3), into east,
+    REP-145: the orientation rotates the IMU's axes, whose directions on the base are `R_base_imu` (3, 3), to east,
     north and up. `offset_rad` is added, counter-clockwise. PoseError where the orientation follows another convention,
-    which shows in that it does not turn the measured acceleration upwards.
+    which shows in that it does not rotate the measured acceleration upwards.
     """
     if imu.orientation_covariance[0] < 0.0:
         return None
@@ -88,16 +88,16 @@ def heading_prior(
     length = float(np.linalg.norm(up))
     if not up[2] > LEVEL_COSINE * length:
         raise PoseError(
-            f"the orientation turns the acceleration into {np.round(up, 2).tolist()}, which does not point up: "
+            f"the orientation rotates the acceleration to {np.round(up, 2).tolist()}, which does not point up: "
             "it must be that of the IMU's axes in east, north, up (REP-145)"
         )
     R_world_base = R_world_imu @ R_base_imu.T
     if R_world_base[2, 2] < LEVEL_COSINE:
-        raise PoseError("the orientation says that the robot lies on its side")
+        raise PoseError("by its orientation the robot lies on its side")
     yaw = math.atan2(R_world_base[1, 0], R_world_base[0, 0]) + offset_rad
     _, heading = _in_grid(frame, np.zeros(3), yaw)
-    told = float(imu.orientation_covariance[8])
-    variance = max(std_rad**2, told if math.isfinite(told) else 0.0)
+    measured = float(imu.orientation_covariance[8])
+    variance = max(std_rad**2, measured if math.isfinite(measured) else 0.0)
     return PosePrior(None, heading, np.diag([math.inf, math.inf, variance]), stamp_of(imu))
 
 
@@ -112,7 +112,7 @@ def _map_covariance(covariance: Float64Array, R_map_frame: Float64Array) -> Floa
     if np.isnan(covariance).any() or (variances < 0.0).any():
         raise PoseError("its covariance is none: variances must not be negative")
     if not covariance.any():
-        return np.diag([UNSAID_STD_M**2, UNSAID_STD_M**2, UNSAID_STD_RAD**2])
+        return np.diag([DEFAULT_STD_M**2, DEFAULT_STD_M**2, DEFAULT_STD_RAD**2])
     # Infinities and what is as good as one would spoil the products.
     most = np.array([UNKNOWN_STD_M] * 3 + [2.0 * UNKNOWN_STD_RAD] * 3)
     scale = np.minimum(1.0, most / np.sqrt(np.maximum(variances, 1e-300)))
@@ -131,10 +131,10 @@ def _map_covariance(covariance: Float64Array, R_map_frame: Float64Array) -> Floa
     return result
 
 
-def _forgetting(covariance: Float64Array, knows_place: bool, knows_heading: bool) -> Float64Array:
+def _forgetting(covariance: Float64Array, has_position: bool, has_heading: bool) -> Float64Array:
     """Return a covariance (3, 3) of easting, northing, heading that is infinite in what is not known."""
     result = covariance.copy()
-    for known, part in ((knows_place, slice(0, 2)), (knows_heading, slice(2, 3))):
+    for known, part in ((has_position, slice(0, 2)), (has_heading, slice(2, 3))):
         if not known:
             result[part, :] = result[:, part] = 0.0
             result[part, part] = np.diag(np.full(result[part, part].shape[0], math.inf))

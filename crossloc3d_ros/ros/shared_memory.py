@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 
 
 def prepare_for_large_clouds(environment: MutableMapping[str, str] | None = None) -> Path | None:
-    """Make Fast DDS, in this process or one started with `environment`, carry clouds without loss.
+    """Make Fast DDS, in this process or one started with `environment`, transport clouds without loss.
 
     Call it before `rclpy.init` in whatever publishes clouds. Returns the profile's path; None where the user has set
     a profile, which is left alone, or uses another middleware, which needs none.

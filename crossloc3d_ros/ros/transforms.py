@@ -35,14 +35,14 @@ class TransformSource:
             # The latest one, not the scan's: a mounting is static, and a scan must not wait for TF.
             return self._latest(self._base_frame_id, frame_id)
         except self._failures as failure:
-            raise CloudError(f"TF knows no pose of '{frame_id}' on '{self._base_frame_id}': {failure}") from failure
+            raise CloudError(f"TF has no pose of '{frame_id}' on '{self._base_frame_id}': {failure}") from failure
 
     def pose_in(self, global_frame_id: str, frame_id: str) -> Float64Array:
         """Return `T_global_frame` (4, 4), the latest known; raises PoseError naming the frames where there is none."""
         try:
             return self._latest(global_frame_id, frame_id)
         except self._failures as failure:
-            raise PoseError(f"TF knows no pose of '{frame_id}' in '{global_frame_id}': {failure}") from failure
+            raise PoseError(f"TF has no pose of '{frame_id}' in '{global_frame_id}': {failure}") from failure
 
     def close(self) -> None:
         """Stop listening."""
@@ -53,7 +53,7 @@ class TransformSource:
 
 
 class MapTransform:
-    """Tell TF where the odometry's frame lies in the map (REP-105)."""
+    """Broadcast the odometry's frame in the map (REP-105)."""
 
     def __init__(self, node: Node, global_frame_id: str, tolerance_ns: int) -> None:
         """Announce /tf; raises ConfigError where tf2_ros is not installed."""
@@ -70,7 +70,7 @@ class MapTransform:
         self._node = node
 
     def send(self, stamp_ns: int, T_map_odom: Float64Array, odom_frame_id: str) -> None:
-        """Publish the pose (4, 4) that a scan of that stamp has told.
+        """Publish the pose (4, 4) estimated from a scan of that stamp.
 
         It is stamped a little ahead, because it holds until the next one comes and TF does not extrapolate.
         """

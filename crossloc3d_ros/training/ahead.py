@@ -37,7 +37,7 @@ class BatchesAhead:
         return self._sampler.submap(town, scan)
 
     def batch(self, step: int, *, pairs: int = 0, hard: HardPlaces | None = None) -> Batch:
-        """See `Sampler.batch`; asks the threads for the steps after this one."""
+        """See `Sampler.batch`; submits the steps after this one to the threads."""
         wanted = [(step + i, pairs, hard) for i in range(self._workers + 1)]
         for key in self._drawn.keys() - set(wanted):
             self._drawn.pop(key).cancel()

@@ -2,7 +2,7 @@
 
 First the log likelihood ratios: how often a beam was returned from a cell, by what the aerial map shows there, and how
 often beams come inside of what the map shows closed, at true poses and at others. Then the calibration: every scan is
-sought on the whole map, and what its best poses scored, right, wrong or off the map, tells which score to believe.
+sought on the whole map, and the scores of its best poses, right, wrong or off the map, calibrate the probability of a score.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from crossloc3d_ros.types import AlignedPoses, Float64Array, no_candidates
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
 """A pose is right within these."""
 
-_OTHERS = 8  # poses elsewhere that each scan is laid at
+_OTHERS = 8  # wrong poses that the evidence of each scan is counted at
 
 Progress = Callable[[str, float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What the best poses of one scan scored."""
+class ScoredPoses:
+    """The scores of the best poses of one scan."""
 
     scores: Float64Array
     """(p,) nats, before the calibration."""
@@ -56,8 +56,8 @@ class Answer:
 
 def fit_alignment(
     pose_set: PoseSet, config: AlignmentConfig | None = None, progress: Progress | None = None
-) -> tuple[ObservationModel, list[Answer]]:
-    """Return the observation model that a pose set teaches, and the answers that its calibration was fitted to.
+) -> tuple[ObservationModel, list[ScoredPoses]]:
+    """Return the observation model learned from a pose set, and the scores that its calibration was fitted to.
 
     The set needs scans on its map and off it; TrainingError otherwise.
     """
@@ -69,26 +69,26 @@ def fit_alignment(
     fitted = fit_log_ratios(*_seen(aerial_map, on_map, report))
     model = ObservationModel(*fitted, expected_share=0.0, temperature=1.0)
     aligner = Aligner(aerial_map, config or AlignmentConfig(), model)
-    answers = []
+    scored = []
     for i, scan in enumerate(pose_set.scans):
-        answer = _answer(aligner, scan, bool(pose_set.on_map[scan.area]))
-        if answer is not None:
-            answers.append(answer)
+        poses = _scored_poses(aligner, scan, bool(pose_set.on_map[scan.area]))
+        if poses is not None:
+            scored.append(poses)
         report("aligning", i + 1, len(pose_set.scans), "scans")
-    share, temperature = calibrate(answers)
-    return dataclasses.replace(model, expected_share=share, temperature=temperature), answers
+    share, temperature = calibrate(scored)
+    return dataclasses.replace(model, expected_share=share, temperature=temperature), scored
 
 
-def calibrate(answers: Sequence[Answer]) -> tuple[float, float]:
-    """Return share of the expected score and temperature that make the right answers likeliest."""
+def calibrate(scored: Sequence[ScoredPoses]) -> tuple[float, float]:
+    """Return share of the expected score and temperature that make the right poses likeliest."""
 
     def loss(x: Float64Array) -> float:
         share, temperature = x[0], math.exp(x[1])
         total = 0.0
-        for answer in answers:
-            log_odds = (answer.scores - share * answer.expected) / temperature + answer.log_prior
+        for poses in scored:
+            log_odds = (poses.scores - share * poses.expected) / temperature + poses.log_prior
             everything = np.logaddexp(0.0, np.logaddexp.reduce(log_odds)) if len(log_odds) else 0.0
-            total += everything - (0.0 if answer.right is None else log_odds[answer.right])
+            total += everything - (0.0 if poses.right is None else log_odds[poses.right])
         return float(total)
 
     best = min(
@@ -106,8 +106,8 @@ def prepared_of(scan: RawScan) -> PreparedScan:
 def is_right(aligned: AlignedPoses, scan: RawScan) -> np.ndarray:
     """Return which aligned poses (p,) are those of the scan."""
     away = np.hypot(*(aligned.grid[:, :2] - scan.T_grid_base[:2, 3]).T)
-    turned = np.abs(wrap(aligned.heading_rad - scan.heading_rad))
-    return np.asarray((away <= RIGHT_M) & (turned <= RIGHT_RAD))
+    rotation = np.abs(wrap(aligned.heading_rad - scan.heading_rad))
+    return np.asarray((away <= RIGHT_M) & (rotation <= RIGHT_RAD))
 
 
 def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> tuple[Float64Array, Float64Array]:
@@ -117,17 +117,17 @@ def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> 
     likelihood = MapLikelihood(aerial_map, nothing)
     likelihood.prepare()
     rng = np.random.default_rng(0)
-    here, elsewhere = np.zeros((CHANNELS, CLASSES)), np.zeros((CHANNELS, CLASSES))
+    at_true, at_others = np.zeros((CHANNELS, CLASSES)), np.zeros((CHANNELS, CLASSES))
     others = _places(likelihood)
     for i, scan in enumerate(scans):
         prepared, T = prepared_of(scan), scan.T_base_lidar
         evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
         true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
-        _lay(evidence, likelihood, true, here)
+        _lay(evidence, likelihood, true, at_true)
         for place in others[rng.integers(0, len(others), _OTHERS)]:
-            _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), elsewhere)
+            _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), at_others)
         report("learning", i + 1, len(scans), "scans")
-    return here, elsewhere
+    return at_true, at_others
 
 
 def _places(likelihood: MapLikelihood) -> Float64Array:
@@ -148,8 +148,8 @@ def _lay(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Array, coun
     np.add.at(counts, (evidence.channel, classes), 1.0)
 
 
-def _answer(aligner: Aligner, scan: RawScan, on_map: bool) -> Answer | None:
-    """Seek one scan on the whole map."""
+def _scored_poses(aligner: Aligner, scan: RawScan, on_map: bool) -> ScoredPoses | None:
+    """Search the whole map for one scan; None where it cannot be aligned."""
     prepared, T = prepared_of(scan), scan.T_base_lidar
     sensor_xy = float(T[0, 3]), float(T[1, 3])
     aligned = aligner.align(prepared, sensor_xy, no_candidates(), search_map=True)
@@ -158,4 +158,4 @@ def _answer(aligner: Aligner, scan: RawScan, on_map: bool) -> Answer | None:
     expected = float(aligner.model.expected @ fine_counts(prepared, sensor_xy))
     right = np.flatnonzero(is_right(aligned, scan)) if on_map else np.empty(0, np.int64)
     # The model's calibration is neutral here: log likelihoods are scores.
-    return Answer(aligned.log_likelihood, expected, int(right[0]) if len(right) else None, aligned.log_prior)
+    return ScoredPoses(aligned.log_likelihood, expected, int(right[0]) if len(right) else None, aligned.log_prior)

@@ -17,7 +17,7 @@ from crossloc3d_ros.types import Float64Array
 
 TRAINING, VALIDATION, TEST = "train", "validation", "test"
 NONE = ""
-"""The role of what lies across a border: it would see two areas."""
+"""The role of what lies across a border: its surroundings reach into two areas."""
 
 _BORDER_SHARES = np.linspace(0.025, 0.975, 39)
 
@@ -63,7 +63,7 @@ class Areas:
 
 
 def cut_areas(xy_m: Float64Array, reach_m: float, shares: Mapping[str, float]) -> Areas:
-    """Return areas that lie side by side, with about `shares` of the scans (N, 2), each seeing `reach_m` around it.
+    """Return adjacent areas with about `shares` of the scans (N, 2), each of which reaches `reach_m` around it.
 
     The borders run north-south or east-west, in the order of areas and at the places that leave the area that comes off
     worst the most of its share, and then the fewest scans across a border. Raises DatasetError where every cut leaves

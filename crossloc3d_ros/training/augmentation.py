@@ -1,4 +1,4 @@
-"""What makes a place look different each time it is drawn."""
+"""Augmentation: a place differs each time that it is drawn."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.types import Float32Array
 
@@ -36,9 +36,9 @@ def occlude(points: Float32Array, rng: np.random.Generator, config: TrainConfig)
 
 
 def heading_error(rng: np.random.Generator, config: TrainConfig) -> float:
-    """Return by how much a scan is turned away from its submap, radians.
+    """Return the rotation of a scan against its submap, radians.
 
-    One heading: anything, the weights learn not to mind it. Several: one of the turned queries is nearly right.
+    One heading: any angle, so that the weights learn to be invariant. Several: within one of the rotated queries.
     """
     most = math.pi if config.headings == 1 else _HEADING_MARGIN * math.pi / config.headings
     return float(rng.uniform(-most, most))
@@ -88,12 +88,12 @@ def paper_batch(
 ) -> tuple[list[Float32Array], list[Float32Array]]:
     """Return scans and submaps as the published recipe changes a batch: all alike.
 
-    Turned about z by up to 5 degrees, mirrored in x and in y with probability 1/4 each.
+    Rotated about z by up to 5 degrees, mirrored in x and in y with probability 1/4 each.
     """
     angle = float(rng.uniform(-_PAPER_TURN_RAD, _PAPER_TURN_RAD))
     signs = np.ones(3, np.float32)
     signs[:2] -= 2.0 * (rng.random(2) < _PAPER_MIRROR_SHARE)
-    scans, submaps = ([turn(points, angle) * signs for points in clouds] for clouds in sides)
+    scans, submaps = ([rotate_about_z(points, angle) * signs for points in clouds] for clouds in sides)
     return scans, submaps
 
 

@@ -2,7 +2,7 @@
 
 A row is a training run in a folder of its own, or a method without learning. Rows are done one after the other; what
 is done is kept, so a table that was stopped goes on where it was. Every row learns from the same places, by the same
-recipe and seed, and is examined on the same benchmark as `evaluate` does it: aerial database, random heading.
+recipe and seed, and is evaluated on the same benchmark as `evaluate` does it: aerial database, random heading.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Result:
     slug: str
     name: str
     encoder: str
-    """Fingerprint of what was examined."""
+    """Fingerprint of the evaluation set."""
     data: str
     """Fingerprint of the benchmark's set."""
     descriptor_size: int
@@ -223,17 +223,17 @@ class Comparison:
     budget: Budget
     evaluation_set: EvaluationSet
     preprocessing: PreprocessingConfig
-    """Of the set's patches: for the methods that carry none of their own."""
+    """Of the set's patches: for the methods that have none of their own."""
     cache: Path
     """Folder in which descriptors are kept."""
     workers: int = 1
     report: Callable[[str, Progress], None] = field(default=lambda slug, progress: None)
     encoding: Callable[[str, float, float, str], None] = field(default=lambda stage, done, total, unit: None)
     row_done: Callable[[list[Result]], None] = field(default=lambda results: None)
-    """Told the results so far after every row."""
+    """Called with the results so far after every row."""
 
     def run(self) -> list[Result]:
-        """Train and examine every row that is not done; return all results in the rows' order.
+        """Train and evaluate every row that is not done; return all results in the rows' order.
 
         A row that fails is left out and does not stop the others; when all are through it is raised as TrainingError.
         A row that was trained with other settings or on other places is refused.

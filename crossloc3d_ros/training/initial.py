@@ -48,7 +48,7 @@ class TakenOver:
     """Named in the weights alone."""
 
     def sentence(self) -> str:
-        """Say it in one line."""
+        """Return it as one line."""
         parts = [f"{len(self.taken)} of {len(self.taken) + len(self.new)} tensors taken over"]
         if self.new:
             parts.append(f"as initialised: {_names(self.new)}")

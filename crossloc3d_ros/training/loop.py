@@ -69,7 +69,7 @@ class Trainer:
     initial: Path | None = None
     """Weights to begin with; a resumed run has its own."""
     preset: str | None = None
-    """Kind of a dataset, where `places` is one and its files do not say it."""
+    """Kind of a dataset, where `places` is one whose files do not name it."""
     report: Callable[[Progress], None] = field(default=lambda progress: None)
     clock: Callable[[], float] = time.monotonic
 
@@ -163,7 +163,7 @@ class Trainer:
                 run_folder.save_state(self.folder, state.to_dict())
 
     def _log_step(self, state: RunState, meter: _Meter, rate: float, log: run_folder.Log) -> None:
-        """Tell and log where the run stands."""
+        """Report and log the progress of the run."""
         samples, loss = meter.clouds_per_second(state), meter.mean()
         used = max(self.budget.share(state.elapsed_s, state.step), 1e-9)
         remaining_s = max(0.0, state.elapsed_s * (1.0 / used - 1.0))

@@ -16,7 +16,7 @@ def squared_distances(a: Tensor, b: Tensor) -> Tensor:
 
 
 class Criterion(Protocol):
-    """What the loop asks of a loss; each is a torch module besides."""
+    """The interface of a loss; each is a torch module besides."""
 
     def __call__(self, scans: Tensor, submaps: Tensor, ignored: Tensor, matches: Tensor) -> Tensor:
         """Return the loss of P pairs, a number.
@@ -29,7 +29,7 @@ class Criterion(Protocol):
 
 
 class InfoNCE(nn.Module):
-    """Tell each scan's submap from all the others of the batch, and the other way round.
+    """Separate each scan's submap from all the others of the batch, and the other way round.
 
     L = -1/2P sum_i [log softmax_j(-s d_ij^2 / D)_ii + log softmax_i(-s d_ij^2 / D)_ii], with d the Euclidean
     distance, D the descriptor's size and s a learned scale.
@@ -83,7 +83,7 @@ class TruncatedSmoothAP(nn.Module):
 
     A query's average precision, over its k nearest matches K among the matches M and the candidates C of the batch:
     AP = 1/|K| sum_{i in K} (1 + sum_{j in M\\i} G_ij) / (1 + sum_{j in C\\i} G_ij), G_ij = sigmoid((d_i - d_j) / t),
-    with d the Euclidean distance over the square root of the descriptor's size. Scans ask for submaps and submaps for
+    with d the Euclidean distance over the square root of the descriptor's size. Scans query submaps and submaps
     scans; the loss is the mean of 1 - AP over both. Truncated to the nearest k as in MinkLoc3Dv2 (ICPR 2022): a match
     that no heading or occlusion lets come near does not pull the others.
     """

@@ -63,7 +63,7 @@ class DatasetRequest:
     output: Path
     topics: Topics = field(default_factory=Topics)
     crs: str | None = None
-    """Of the survey, in place of what its files say."""
+    """Of the survey, in place of the one that its files name."""
     database_bags: tuple[Path, ...] = ()
     """Recordings of `bags` whose scans in the test area are a ground database, not queries."""
     test_boxes: tuple[Bounds, ...] = ()
@@ -129,7 +129,7 @@ def make_dataset(request: DatasetRequest, progress: Progress | None = None) -> D
 
 
 class _Dataset:
-    """Submaps and scans with their roles, and the files that say so."""
+    """Submaps and scans with their roles, and the files that list them."""
 
     def __init__(
         self, request: DatasetRequest, aerial: AerialPatches, recordings: Sequence[tuple[str, RecordedScans]]

@@ -27,11 +27,11 @@ from crossloc3d_ros.training.shards import (
 
 
 class Material(Protocol):
-    """What a run learns from, on disk; it is read when it is asked for."""
+    """What a run learns from, on disk; it is read on demand."""
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Where it lies."""
+        """Its folder."""
         ...
 
     @property
@@ -114,7 +114,7 @@ def read_material(
 
     `preset`: the dataset's kind, where it is not the one that its files suggest. Raises TrainingError for a folder
     that is named twice, is damaged or holds neither, and where places were made for another `preprocessing`: their
-    validation patches would examine what was not learned.
+    validation patches would not be those that the weights were trained on.
     """
     if not folders:
         raise TrainingError("name a folder of places to learn from")

@@ -10,7 +10,7 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # malloc.h of the
 
 
 def keep_freed_memory() -> bool:
-    """Ask the allocator not to give freed memory back to the system; return whether it agreed.
+    """Make the allocator keep freed memory instead of returning it to the system; return whether it does.
 
     Every step allocates the same large tensors anew. Returned to the system, each comes back as fresh pages that have
     to be faulted in and zeroed: ten times the cost of writing them.

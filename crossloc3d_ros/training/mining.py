@@ -21,10 +21,10 @@ _ROWS = 1024  # rows of the distance matrix held at once
 def mine(
     sampler: Sampler, encode: Callable[[list[Float32Array]], Float32Array], config: TrainConfig, step: int
 ) -> HardPlaces:
-    """Compare the submaps around places of all towns and return what looks most alike elsewhere.
+    """Compare the submaps around places of all towns and return the most similar other places of each.
 
-    `config.mined_places` of the places are drawn, by the seed and the step alone; elsewhere is another town, or the
-    same one more than 100 m away. All submaps are seen to the north. Raises TrainingError where there is too little
+    `config.mined_places` of the places are drawn, by the seed and the step alone; other places are in
+    another town, or more than 100 m away. All submaps are north up. Raises TrainingError where there is too little
     to compare.
     """
     town, scan, xy_m = sampler.places

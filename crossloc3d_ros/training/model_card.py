@@ -290,7 +290,7 @@ included; training loss at the end {loss}.
 
 
 def _recipe(config: TrainConfig) -> str:
-    """Say the recipe in words."""
+    """Return the recipe in words."""
     losses = {
         "info_nce": "cross entropy of each pair against the whole batch, both ways",
         "smooth_ap": "truncated smooth average precision over the whole batch, both ways",

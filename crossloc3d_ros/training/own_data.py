@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.datasets.place_sets import PlaceSet
 from crossloc3d_ros.datasets.published import PatchSource, load_evaluation_set, open_source, place_set
@@ -69,7 +69,7 @@ class PatchSampler:
         self._anchors = np.array(anchors, np.int64)
         if unknown_heading and not anchors:
             raise TrainingError(
-                f"{source.folder} does not say the headings of its scans: train with headings 1, not {config.headings}"
+                f"{source.folder} holds no headings of its scans: train with headings 1, not {config.headings}"
             )
         if not anchors:
             what = "an aerial submap" if from_air else "another cloud"
@@ -87,7 +87,7 @@ class PatchSampler:
     def places(self) -> tuple[Int64Array, Int64Array, Float64Array]:
         """Return town (N,), which is 0, scan (N,) and position (N, 2), metres, of all scans to learn from."""
         if not self._known:
-            raise TrainingError(f"{self._source.folder} does not say where its clouds lie: train without hard_share")
+            raise TrainingError(f"{self._source.folder} holds no positions of its clouds: train without hard_share")
         numbers = np.arange(len(self._anchors), dtype=np.int64)
         return np.zeros_like(numbers), numbers, self._clouds.xy_m[self._anchors]
 
@@ -113,8 +113,8 @@ class PatchSampler:
         scan_rows = np.empty(pairs, np.int64)
         submap_rows = np.empty(pairs, np.int64)
         for i in range(pairs):
-            wish = wanted[i - pairs] if i >= pairs - len(wanted) else None
-            scan, submap, scan_rows[i], submap_rows[i] = self._pair(rng, scan_rows[:i], wish)
+            request = wanted[i - pairs] if i >= pairs - len(wanted) else None
+            scan, submap, scan_rows[i], submap_rows[i] = self._pair(rng, scan_rows[:i], request)
             scans.append(scan)
             submaps.append(submap)
         if config.augmentation == "paper":
@@ -123,13 +123,13 @@ class PatchSampler:
         return Batch(scans, submaps, ignored, matches)
 
     def _pair(
-        self, rng: np.random.Generator, taken: Int64Array, wish: int | None
+        self, rng: np.random.Generator, taken: Int64Array, request: int | None
     ) -> tuple[Float32Array, Float32Array, int, int]:
         """Return a scan, a submap of its place and the rows of both; the place is not among those `taken`."""
         config, clouds = self._config, self._clouds
         choices = self._choices(rng, taken)
         for attempt in range(_ATTEMPTS):
-            number = wish if wish is not None and attempt == 0 else int(rng.choice(choices))
+            number = request if request is not None and attempt == 0 else int(rng.choice(choices))
             row = int(self._anchors[number])
             other = int(rng.choice(self._positives[number]))
             scan = self._source.patch(clouds.files[row], is_ground=True)
@@ -142,11 +142,11 @@ class PatchSampler:
             if len(scan) == 0:
                 continue
             quarter = int(rng.integers(4))
-            submap = turn(submap, quarter * math.pi / 2.0)
+            submap = rotate_about_z(submap, quarter * math.pi / 2.0)
             angle = heading_error(rng, config)
             if config.headings > 1:
                 angle += float(clouds.heading_rad[row]) + quarter * math.pi / 2.0
-            scan = turn(scan, angle)
+            scan = rotate_about_z(scan, angle)
             if rng.integers(2):
                 mirror = np.array([1.0, -1.0, 1.0], np.float32)
                 scan, submap = scan * mirror, submap * mirror
@@ -208,7 +208,7 @@ class PatchSampler:
         places = self._clouds.xy_m[rows]
         places = places[np.isfinite(places).all(axis=1)]
         if len(places) == 0:
-            return f"{int(rows.sum()):,} clouds, positions not said"
+            return f"{int(rows.sum()):,} clouds, positions unknown"
         (west, south), (east, north) = places.min(axis=0), places.max(axis=0)
         return f"easting {west:.0f} to {east:.0f}, northing {south:.0f} to {north:.0f}"
 
@@ -275,7 +275,7 @@ def _roles(folder: Path, kind: Preset, tuples: TrainingTuples, config: TrainConf
         return np.full(len(clouds), TRAINING, dtype="<U10")
     if not np.isfinite(clouds.xy_m).all():
         raise TrainingError(
-            f"{folder} does not say where its training clouds lie, so that no area can be held out to validate on; "
+            f"{folder} holds no positions of its training clouds, so that no area can be held out to validate on; "
             "Oxford RobotCar's positions stand in the .csv files beside its clouds"
         )
     if kind.name == "oxford":
@@ -294,7 +294,7 @@ def _roles(folder: Path, kind: Preset, tuples: TrainingTuples, config: TrainConf
 
 
 def _other_runs(clouds: CloudTable) -> tuple[CloudTable, CloudTable]:
-    """Return the clouds of the run that has the most of them, to be looked for among those of the other runs."""
+    """Return the clouds of the run that has the most of them, to be retrieved from those of the other runs."""
     runs = np.array([file.rsplit("/", 2)[0] for file in clouds.files])
     names, counts = np.unique(runs, return_counts=True)
     is_query = runs == names[counts.argmax()] if len(names) > 1 else np.arange(len(clouds)) % 2 == 0

@@ -46,7 +46,7 @@ _UNCLASSIFIED = 1  # ASPRS class
 _SEEDS_A_SET = 100_000  # towns of one set's seed never meet those of another
 _VALIDATION_SEEDS = 50_000  # from here on a set's seeds are for validation
 _DIAGONAL = 2.0**0.5 + 0.01  # of a square over its side, and a hair for rounding
-_MOST_SCAN_POINTS = 30_000  # more than a turn of the sensor has: every point is kept
+_MOST_SCAN_POINTS = 30_000  # more than one revolution of the sensor has: every point is kept
 _SURFACE_STREAM = 11  # the random numbers of surfaces, apart from those of scans
 SURFACE_CLEARANCE_M = 1.5
 """As a route through a real survey keeps by default."""
@@ -73,14 +73,14 @@ class Made:
 
 
 def plan_towns(seed: int, towns: int, validation_towns: int, families: Sequence[str]) -> list[TownTask]:
-    """Return the towns of a set, validation first, families in turns; more towns extend a set without changing it.
+    """Return the towns of a set, validation first, families in rotation; more towns extend a set without changing it.
 
     A family may be named more than once; without any, all are taken but those held out for the benchmark. Raises
     ConfigError for unknown families and for a held-out one among those to learn from.
     """
     if towns < 0 or validation_towns < 0 or max(towns, validation_towns) > _VALIDATION_SEEDS:
         raise ConfigError(
-            f"a set holds 0 to {_VALIDATION_SEEDS:,} towns of each role, asked for {towns} and {validation_towns}"
+            f"a set holds 0 to {_VALIDATION_SEEDS:,} towns of each role, not {towns} and {validation_towns}"
         )
     unknown = sorted(set(families) - set(FAMILIES))
     if unknown:

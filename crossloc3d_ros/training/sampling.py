@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numba import njit
 
-from crossloc3d_ros.clouds.patch import make_patch, turn
+from crossloc3d_ros.clouds.patch import make_patch, rotate_about_z
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training.augmentation import change, heading_error, occlude, paper_batch, paper_cloud
@@ -46,7 +46,7 @@ class HardPlaces:
     scan: Int64Array
     """(N,) index of the scan in it, which is where the place is."""
     neighbours: Int64Array
-    """(N, K) rows of the places with the nearest descriptors, all of them elsewhere."""
+    """(N, K) rows of the places with the nearest descriptors, all of them other places."""
 
 
 class Sampler(Protocol):
@@ -74,8 +74,8 @@ _Pair = tuple[Float32Array, Float32Array, Float64Array, Float64Array]
 """Scan, submap, place and the submap's centre."""
 
 
-class _Wish(NamedTuple):
-    """A place that a pair is wanted of."""
+class _Request(NamedTuple):
+    """A place that a pair is to be made of."""
 
     town: int
     scan: int
@@ -83,7 +83,7 @@ class _Wish(NamedTuple):
 
 
 class PointField:
-    """A town's above-ground points in square cells, for cutting turned squares quickly."""
+    """A town's above-ground points in square cells, for cutting rotated squares quickly."""
 
     def __init__(self, points: Float32Array) -> None:
         low = points[:, :2].min(axis=0)
@@ -154,8 +154,8 @@ class BatchSampler:
         places = np.empty((pairs, 2))
         centres = np.empty((pairs, 2))
         for i, town in enumerate(towns.tolist()):
-            wish = wanted[i - pairs] if i >= pairs - len(wanted) else None
-            scan, submap, places[i], centres[i] = self._pair(town, rng, places[:i][towns[:i] == town], wish)
+            request = wanted[i - pairs] if i >= pairs - len(wanted) else None
+            scan, submap, places[i], centres[i] = self._pair(town, rng, places[:i][towns[:i] == town], request)
             scans.append(scan)
             submaps.append(submap)
         if config.augmentation == "paper":
@@ -166,39 +166,39 @@ class BatchSampler:
         np.fill_diagonal(matches, True)
         return Batch(scans, submaps, same_town & (apart < config.neighbour_m) & ~matches, matches)
 
-    def _hard_places(self, rng: np.random.Generator, count: int, hard: HardPlaces) -> list[_Wish]:
+    def _hard_places(self, rng: np.random.Generator, count: int, hard: HardPlaces) -> list[_Request]:
         """Return `count` places in groups of such as are taken for each other; a group is seen along one heading."""
-        wanted: list[_Wish] = []
+        wanted: list[_Request] = []
         while len(wanted) < count:
             row = int(rng.integers(len(hard.town)))
             others = rng.permutation(hard.neighbours[row])[: _HARD_GROUP - 1]
             heading = float(rng.uniform(0.0, 2.0 * math.pi))
-            wanted += [_Wish(int(hard.town[r]), int(hard.scan[r]), heading) for r in (row, *others)]
+            wanted += [_Request(int(hard.town[r]), int(hard.scan[r]), heading) for r in (row, *others)]
         return wanted[:count]
 
-    def _pair(self, town_index: int, rng: np.random.Generator, taken: Float64Array, wish: _Wish | None) -> _Pair:
+    def _pair(self, town_index: int, rng: np.random.Generator, taken: Float64Array, request: _Request | None) -> _Pair:
         """Return a scan, a submap that it lies in, the scan's place and the submap's centre.
 
-        The place is the one wished for, or one not yet among those `taken`, and then with probability `near_share`
+        The place is the requested one, or one not yet among those `taken`, and then with probability `near_share`
         near one of them.
         """
         town, field, config = self._towns[town_index], self._fields[town_index], self._config
-        wish_near = len(taken) > 0 and rng.random() < config.near_share
+        wants_near = len(taken) > 0 and rng.random() < config.near_share
         for attempt in range(_ATTEMPTS):
-            wished = wish is not None and attempt == 0
-            index = wish.scan if wish is not None and wished else int(rng.integers(len(town)))
+            is_requested = request is not None and attempt == 0
+            index = request.scan if request is not None and is_requested else int(rng.integers(len(town)))
             place = town.scan_xy_m[index]
             nearest_m = float(np.hypot(*(taken - place).T).min()) if len(taken) else math.inf
             far_enough = nearest_m >= config.neighbour_m
-            near_enough = far_enough and (not wish_near or nearest_m <= config.near_m)
-            if not wished and (
+            near_enough = far_enough and (not wants_near or nearest_m <= config.near_m)
+            if not is_requested and (
                 (not near_enough and attempt < _ATTEMPTS // 2) or (not far_enough and attempt < 3 * _ATTEMPTS // 4)
             ):
                 continue
             if config.augmentation == "paper":
                 pair = self._paper_pair(town, field, index, rng)
             else:
-                pair = self._augmented_pair(town, field, index, None if wish is None else wish.heading_rad, rng)
+                pair = self._augmented_pair(town, field, index, None if request is None else request.heading_rad, rng)
             if pair is not None:
                 return pair
         raise TrainingError(
@@ -225,7 +225,7 @@ class BatchSampler:
         if scan is None or submap is None:
             return None
         angle = float(town.scan_heading_rad[index]) - heading + heading_error(rng, config)
-        scan_points = turn(scan.points, angle)
+        scan_points = rotate_about_z(scan.points, angle)
         if mirrored:
             scan_points[:, 1] *= -1.0
         return scan_points, submap.points, place, centre

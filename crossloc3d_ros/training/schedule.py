@@ -23,7 +23,7 @@ class Budget:
             raise TrainingError("the training's budget must be positive")
 
     def option(self) -> str:
-        """Return the budget as it is said on the command line."""
+        """Return the budget as it is written on the command line."""
         return f"--budget-steps {self.steps}" if self.steps is not None else f"--budget-minutes {self.minutes:g}"
 
     def share(self, elapsed_s: float, step: int) -> float:

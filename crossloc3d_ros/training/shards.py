@@ -1,4 +1,4 @@
-"""Simulated towns on disk: one file a town, and a manifest that says how they were made."""
+"""Simulated towns on disk: one file a town, and a manifest of how they were made."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ValidationTown:
 
 @dataclass(frozen=True)
 class TownEntry:
-    """What the manifest says about one town."""
+    """One town's entry of the manifest."""
 
     file: str
     role: str

@@ -62,7 +62,7 @@ def make_survey_places(
     poses = _sample_poses(world, survey, scans, config, preprocessing, rng)
     parts = [rows for rows in _parts(poses[:, :2, 3], survey) if len(rows) >= _LEAST_SCANS]
     if not parts:
-        raise AerialDataError(f"{survey.name}: {scans} scans are too few for its area; ask for more")
+        raise AerialDataError(f"{survey.name}: {scans} scans are too few for its area; request more")
     stopwatch = Stopwatch()
     for number, rows in enumerate(parts):
         file = f"{TRAINING}_{seed}_{number:04d}_{FAMILY}.npz"

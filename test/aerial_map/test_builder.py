@@ -235,7 +235,7 @@ def test_two_reference_systems_are_refused_by_name(tmp_path: Path, survey: Any, 
 
 def test_a_file_without_crs_is_refused_and_built_with_one(tmp_path: Path, survey: Any, encoder: Any) -> None:
     write_laz(tmp_path / "a.laz", survey.points, survey.classification, None)
-    with pytest.raises(AerialDataError, match=r"a\.laz does not say its CRS"):
+    with pytest.raises(AerialDataError, match=r"a\.laz names no CRS"):
         build_map([tmp_path], tmp_path / "map", encoder)
     assert build_map([tmp_path], tmp_path / "map", encoder, crs=CRS).manifest.crs == CRS
 

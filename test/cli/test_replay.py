@@ -325,7 +325,7 @@ def test_publishing_refuses_in_one_line(
     publish = [str(installed.bag), "--publish"]
     assert "'rate' must lie between" in fails(capsys, [*publish, "--rate", "0"])
     assert "its topics are: /gnss" in fails(capsys, [*publish, "--play-topics", "/points"])
-    assert "nobody subscribed to /velodyne_points" in fails(capsys, [*publish, "--wait-s", "0.2"])
+    assert "no node subscribed to /velodyne_points" in fails(capsys, [*publish, "--wait-s", "0.2"])
 
 
 def test_publishing_plays_everything(

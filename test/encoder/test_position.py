@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import ModelConfig
 from crossloc3d_ros.encoder.compiled import CompiledModel
 from crossloc3d_ros.encoder.model import CrossLoc3D, PositionEmbedding
@@ -41,7 +41,7 @@ def test_compiled_network_embeds_as_torch_does(kind: str, threads: int) -> None:
 
 def test_radial_embedding_does_not_mind_turns_and_cartesian_does() -> None:
     places = _cloud(1)
-    turned = turn(places, 1.0)
+    turned = rotate_about_z(places, 1.0)
     for kind, equal in (("radial", True), ("cartesian", False)):
         embedding = PositionEmbedding(kind, 8)
         torch.nn.init.normal_(embedding.linear.weight)

@@ -162,14 +162,14 @@ def test_geotiff_keys_without_a_known_code_ask_for_the_crs(tmp_path: Path, keys:
 
 def test_a_file_without_crs_asks_for_it(tmp_path: Path) -> None:
     write_laz(tmp_path / "a.laz", *cloud(10), None)
-    with pytest.raises(AerialDataError, match=r"a\.laz does not say its CRS.*--crs EPSG"):
+    with pytest.raises(AerialDataError, match=r"a\.laz names no CRS.*--crs EPSG"):
         read_header(tmp_path / "a.laz")
     assert read_header(tmp_path / "a.laz", "EPSG:28992").crs == "EPSG:28992"
     with pytest.raises(AerialDataError, match="not understood"):
         read_header(tmp_path / "a.laz", "Amsterdam")
 
 
-@pytest.mark.parametrize(("text", "message"), [("", "does not say"), ("\0\0", "does not say"), ("PROJCS[", "--crs")])
+@pytest.mark.parametrize(("text", "message"), [("", "names no CRS"), ("\0\0", "names no CRS"), ("PROJCS[", "--crs")])
 def test_a_broken_crs_record_asks_for_the_crs(tmp_path: Path, text: str, message: str) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.vlrs.append(WktCoordinateSystemVlr(text))

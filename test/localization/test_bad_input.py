@@ -306,7 +306,7 @@ def test_an_imu_that_tells_down_for_up(ride: Ride) -> None:
     told = robot.drive(robot.ahead(6), force=lambda force: axes * force)
     told += other.drive(other.ahead(8), force=lambda force: -force)[1:]  # for half a second up is still up
     no_fix(told)
-    says(told, "gravity says that the robot lies on its side")
+    says(told, "by the measured gravity the robot lies on its side")
     found(robot, robot.ahead(18))
     found(other, other.ahead(4))
 

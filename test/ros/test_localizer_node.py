@@ -282,7 +282,7 @@ def test_an_initial_pose_that_nothing_explains_is_refused_with_the_reason(active
     for message, reason in (
         (guess("map", 5_000.0, 0.0), "outside of the map"),
         (guess("", 0.0, 0.0), "names no frame"),
-        (guess("moon", 0.0, 0.0), "TF knows no pose of 'moon' in 'map'"),
+        (guess("moon", 0.0, 0.0), "TF has no pose of 'moon' in 'map'"),
     ):
         active.guesses.publish(message)
         active.diagnosis_with("initial pose", reason)
@@ -637,7 +637,7 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
     robot.wait_until(lambda: answers and answers[-1].header.stamp == upside_down.header.stamp, what="for the answer")
     assert answers[-1].status.status == NavSatStatus.STATUS_NO_FIX
     assert "points down: at rest it must be +9.8 upwards" in managed.output
-    managed.wait_for_output("gravity says that the robot lies on its side", 10.0)
+    managed.wait_for_output("by the measured gravity the robot lies on its side", 10.0)
 
     if find_spec("kiss_icp") is not None:
         the_scans_tell_how_the_robot_moves(robot, world, clouds)

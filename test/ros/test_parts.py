@@ -29,7 +29,7 @@ from crossloc3d_ros.errors import CloudError, ConfigError
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.localization.session import Outcome
 from crossloc3d_ros.ros.conversions import matrix_from_transform, stamp_message
-from crossloc3d_ros.ros.diagnostics import Statistics, judge_health, worker_complaint
+from crossloc3d_ros.ros.diagnostics import Statistics, health_status, worker_complaint
 from crossloc3d_ros.ros.shared_memory import PROFILES_VARIABLE, SEGMENT_BYTES, prepare_for_large_clouds
 from crossloc3d_ros.ros.transforms import TransformSource
 from crossloc3d_ros.ros.worker import Worker
@@ -238,7 +238,7 @@ def test_a_home_that_cannot_be_written_is_no_obstacle(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize(
     ("publishers", "complaint", "level", "words"),
     [
-        (0, "", DiagnosticStatus.WARN, "nobody publishes on /points"),
+        (0, "", DiagnosticStatus.WARN, "no publisher on /points"),
         (2, "", DiagnosticStatus.WARN, "(2 publishers)"),
         (1, "incompatible RELIABILITY", DiagnosticStatus.ERROR, "incompatible RELIABILITY"),
     ],
@@ -248,9 +248,9 @@ def test_silence_is_explained(
 ) -> None:
     statistics = Statistics()
     now = time.monotonic()
-    assert judge_health(statistics.snapshot(), "/points", publishers, complaint)[0] == DiagnosticStatus.OK
+    assert health_status(statistics.snapshot(), "/points", publishers, complaint)[0] == DiagnosticStatus.OK
     monkeypatch.setattr("crossloc3d_ros.ros.diagnostics.time.monotonic", lambda: now + 60)
-    told, message = judge_health(statistics.snapshot(), "/points", publishers, complaint)
+    told, message = health_status(statistics.snapshot(), "/points", publishers, complaint)
     assert told == level
     assert words in message
 
@@ -263,7 +263,7 @@ def test_clouds_that_get_lost_are_told_even_with_a_fix(lost: int, level: bytes) 
         statistics.received()
     statistics.processed(Outcome(estimate, is_fault=False), latency_ms=20.0)
     statistics.lost(lost)
-    told, message = judge_health(statistics.snapshot(), "/points", 1, "")
+    told, message = health_status(statistics.snapshot(), "/points", 1, "")
     assert told == level
     assert (f"{lost} of {60 + lost} clouds on /points were lost" in message) == (level == DiagnosticStatus.WARN)
 
@@ -319,7 +319,7 @@ def test_the_mounting_comes_from_tf_or_is_missed_by_name(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "tf2_ros", FakeTf2("tf2_ros"))
     source = TransformSource(node=None, base_frame_id="base_link")
     np.testing.assert_allclose(source.pose_on_base("velodyne")[:3, 3], [0, 0, 1.7])
-    with pytest.raises(CloudError, match="TF knows no pose of 'lidar' on 'base_link'"):
+    with pytest.raises(CloudError, match="TF has no pose of 'lidar' on 'base_link'"):
         source.pose_on_base("lidar")
     source.close()
 

@@ -186,7 +186,7 @@ def test_nobody_listening_is_said(tmp_path: Path, own_domain: None) -> None:
     player = player_process(path, "play_bag(reader, PlayerConfig(wait_s=0.5))")
     _, errors = player.communicate(timeout=30)
     assert player.returncode != 0
-    assert "nobody subscribed to /velodyne_points within 0.5 s" in errors
+    assert "no node subscribed to /velodyne_points within 0.5 s" in errors
 
 
 def test_ctrl_c_ends_the_player_cleanly(tmp_path: Path, own_domain: None) -> None:
@@ -247,7 +247,7 @@ def test_what_cannot_be_played_is_said(tmp_path: Path, own_domain: None) -> None
             Player(reader, node, PlayerConfig(), topics=["/nothing"])
         with bag.open_bag(path) as reader, pytest.raises(BagError, match="nothing that could be played"):
             Player(reader, node, PlayerConfig(), topics=[])
-        with bag.open_bag(path) as reader, pytest.raises(CrossLocError, match="nobody subscribed"):
+        with bag.open_bag(path) as reader, pytest.raises(CrossLocError, match="no node subscribed"):
             Player(reader, node, PlayerConfig(wait_s=0.1)).wait_for_subscribers()
     finally:
         node.destroy_node()

@@ -264,7 +264,7 @@ def test_odometry_of_another_frame_is_brought_to_the_base_where_tf_relates_them(
     np.testing.assert_allclose(sample.T_odom_base, on_the_ramp(0.0), atol=1e-9)
 
     def nothing(frame: str) -> np.ndarray:
-        raise CloudError(f"TF knows no pose of '{frame}' on 'base_link'")
+        raise CloudError(f"TF has no pose of '{frame}' on 'base_link'")
 
     for how, reason in (({}, "set base_frame_id to 'imu_link'"), ({"pose_on_base": nothing}, "TF knows no pose")):
         odometry = odometry_input(**how)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.patch import make_patch, turn
+from crossloc3d_ros.clouds.patch import make_patch, rotate_about_z
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
 from crossloc3d_ros.training.loop import Trainer
@@ -57,7 +57,7 @@ def scan_of(points: Float32Array, place: Float64Array, rng: np.random.Generator,
     around = points - np.array([*place, 0.0], np.float32)
     around = around[np.hypot(around[:, 0], around[:, 1]) < 70.0]
     around = around[rng.random(len(around)) < 0.7]
-    return turn(around.astype(np.float32), -heading_rad)
+    return rotate_about_z(around.astype(np.float32), -heading_rad)
 
 
 def training_town(seed: int, scans: int = 30) -> TrainingTown:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.clouds.tiling import cut_submap
 from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
@@ -104,7 +104,7 @@ def test_the_paper_s_batches_keep_the_headings_and_change_all_clouds_alike(
         batch = sampler.batch(step)
         best = []
         for index in range(len(town)):
-            scan = turn(batch.scans[0], float(town.scan_heading_rad[index]))
+            scan = rotate_about_z(batch.scans[0], float(town.scan_heading_rad[index]))
             best.append(min(nearest(scan * sign, batch.submaps[0] * sign) for sign in mirrors()))
         assert min(best) < 0.12
 

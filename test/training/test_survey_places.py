@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import PlacesConfig, PreprocessingConfig, TrainConfig
 from crossloc3d_ros.errors import AerialDataError, TrainingError
 from crossloc3d_ros.formats.las import write_laz
@@ -46,7 +46,7 @@ def test_scans_lie_on_the_survey_that_they_were_cast_in(places: Path) -> None:
         town = read_training_town(places / entry.file)
         tree = KDTree(town.survey_points)
         for i in range(len(town)):
-            seen = turn(town.scan_points(i), float(town.scan_heading_rad[i]))
+            seen = rotate_about_z(town.scan_points(i), float(town.scan_heading_rad[i]))
             seen[:, :2] += town.scan_xy_m[i].astype(np.float32)
             high = seen[seen[:, 2] > 1.0]
             if len(high) > 50:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.training.validation import Places, ground_distances, score, validate
 from crossloc3d_ros.types import Float32Array
@@ -51,7 +51,7 @@ def test_a_query_turned_by_steps_finds_the_submap_that_a_heading_sensitive_code_
     rng = np.random.default_rng(3)
     submaps = rng.uniform(-1, 1, (40, 64, 3)).astype(np.float32)
     headings = 2 * np.pi * rng.integers(0, 8, 40) / 8
-    queries = np.stack([turn(cloud, angle) for cloud, angle in zip(submaps, headings, strict=True)])
+    queries = np.stack([rotate_about_z(cloud, angle) for cloud, angle in zip(submaps, headings, strict=True)])
     xy_m = np.column_stack([500.0 * np.arange(40.0), np.zeros(40)])
     town = ValidationTown("town", xy_m, queries, xy_m, submaps)
 

@@ -77,7 +77,7 @@ class Pyramid(nn.Module):
 
 
 class MinkLoc3D(Network):
-    """MinkLoc3D, or v2, or -S, as `config.network` says."""
+    """MinkLoc3D, or v2, or -S, as named by `config.network`."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

@@ -20,7 +20,7 @@ from crossloc3d_ros.encoder.sparse import KernelMap, VoxelGrid, sparse_convoluti
 def halve(grid: VoxelGrid) -> tuple[VoxelGrid, KernelMap]:
     """Return the grid of twice the stride and the map of a convolution with kernel 2 and stride 2 onto it.
 
-    Kernel index k = ix + 2 iy + 4 iz says which of the eight corners of its coarse site a site is.
+    Kernel index k = ix + 2 iy + 4 iz is which of the eight corners of its coarse site a site is.
     """
     coarse = grid.downsample()
     step = coarse.stride
@@ -72,7 +72,7 @@ class Doubling(nn.Module):
 
 
 class EfficientChannelAttention(nn.Module):
-    """Scale each channel by what its neighbours among the cloud's means say (ECA-Net, CVPR 2020).
+    """Scale each channel by its neighbours among the cloud's means (ECA-Net, CVPR 2020).
 
     The reach along the channels grows with their number: the odd number next to or above (log2 C + 1) / 2.
     """

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.datasets.place_sets import PlaceSet
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.files import atomic_path
@@ -117,7 +117,7 @@ def time_queries(
     for i in range(min(len(places), _TIMED_QUERIES + 1)):
         cloud = np.array(places.patches[i])
         started = time.perf_counter()
-        descriptors = encoder.encode_batch([turn(cloud, float(angle)) for angle in angles])
+        descriptors = encoder.encode_batch([rotate_about_z(cloud, float(angle)) for angle in angles])
         encoded = time.perf_counter()
         if own is not None:
             own.distances(descriptors, database)
@@ -140,7 +140,7 @@ def _chunks(
 
 def _encode_chunk(chunk: _Chunk, encoder: DescriptorEncoder, advance: Callable[[int], None] | None) -> None:
     clouds = [
-        turn(cloud, float(angle)) if angle else cloud
+        rotate_about_z(cloud, float(angle)) if angle else cloud
         for cloud, angles in zip(chunk.clouds, chunk.angles_rad, strict=True)
         for angle in angles
     ]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.evaluation.retrieval.encoding import north_angles
 from crossloc3d_ros.evaluation.retrieval.predictions import Predictions, database_of, metres_of
@@ -102,7 +102,7 @@ def top_view(points: Float32Array, half_extent_m: float, pixels: int = _PIXELS) 
 def _picture(
     places: PlaceSet, row: int, north_rad: float, half_extent_m: float, caption: str, right: bool | None
 ) -> Picture:
-    points = turn(np.asarray(places.patches[row]), north_rad)
+    points = rotate_about_z(np.asarray(places.patches[row]), north_rad)
     return Picture(_png_uri(top_view(points, half_extent_m)), caption, right)
 
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crossloc3d_ros.clouds.height_map import Complex64Array, HeightMatcher, height_raster
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import HeightMapConfig, VerificationConfig
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.errors import EvaluationError
@@ -165,7 +165,7 @@ def compare(
 
     def one(row: int) -> tuple[Float32Array, Float64Array]:
         points = np.array(queries.patches[row])
-        return comparer.compare(turn(points, float(angles[row])) if angles[row] else points, ids[row])
+        return comparer.compare(rotate_about_z(points, float(angles[row])) if angles[row] else points, ids[row])
 
     distances, headings = np.empty(ids.shape, np.float32), np.empty(ids.shape, np.float32)
     with ThreadPoolExecutor(max(1, threads)) as pool:

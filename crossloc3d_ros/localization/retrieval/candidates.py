@@ -8,7 +8,7 @@ import numpy as np
 
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.store import AerialMap
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import CalibrationConfig
 from crossloc3d_ros.localization.retrieval.place_belief import candidate_probabilities
 from crossloc3d_ros.types import (
@@ -36,7 +36,7 @@ def encode_query(encoder: DescriptorEncoder, points: Float32Array) -> Float32Arr
     if headings * rotations == 1:
         return encoder.encode(points)[None]
     count = headings if headings > 1 else rotations
-    descriptors = encoder.encode_batch([turn(points, float(angle)) for angle in heading_angles(count)])
+    descriptors = encoder.encode_batch([rotate_about_z(points, float(angle)) for angle in heading_angles(count)])
     return descriptors if headings > 1 else descriptors.mean(axis=0, keepdims=True)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.datasets.place_sets import PlaceSet
 from crossloc3d_ros.errors import EvaluationError
@@ -64,7 +64,7 @@ def test_descriptors_are_those_of_the_turned_patches(tmp_path: Path) -> None:
     for i in (0, 17, 299):
         for a in (0, 1):
             np.testing.assert_allclose(
-                found[i, a], turn(np.asarray(asked.patches[i]), angles[i, a]).mean(axis=0), atol=1e-6
+                found[i, a], rotate_about_z(np.asarray(asked.patches[i]), angles[i, a]).mean(axis=0), atol=1e-6
             )
 
 

@@ -8,7 +8,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.evaluation.retrieval.gallery import Picture, choose, gallery, top_view
 from crossloc3d_ros.evaluation.retrieval.predictions import About, Predictions
@@ -59,11 +59,11 @@ def test_the_choice_is_by_lot_and_always_the_same() -> None:
 
 def test_frames_and_captions_say_what_is_right() -> None:
     heading = 1.2
-    queries = PlaceSet([turn(CORNER, -heading)], np.zeros(1, np.int64), np.zeros((1, 2)), np.array([heading]))
+    queries = PlaceSet([rotate_about_z(CORNER, -heading)], np.zeros(1, np.int64), np.zeros((1, 2)), np.array([heading]))
     places = PlaceSet(
         [CORNER] * 3, np.array([0, 0, 1]), np.array([[30.0, 40.0], [0.0, 400.0], [0.0, 0.0]]), np.zeros(3)
     )
-    ground = PlaceSet([turn(CORNER, 0.5)], np.zeros(1, np.int64), np.array([[0.0, 8.0]]), np.array([-0.5]))
+    ground = PlaceSet([rotate_about_z(CORNER, 0.5)], np.zeros(1, np.int64), np.array([[0.0, 8.0]]), np.array([-0.5]))
     towns = EvaluationSet("t", queries, places, ground, ("old_town 1", "new_town 2"), ("a", "b"))
     about = About("t", towns.fingerprint(), "w", "e", "aerial+ground", "random")
     ids = np.array([[0, 1, 2, 3]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.errors import ConfigError, EvaluationError
@@ -87,7 +87,7 @@ def place_set(xy_m: np.ndarray, area: np.ndarray, heading_rad: np.ndarray) -> Pl
     for (x, y), number, heading in zip(xy_m, area, heading_rad, strict=True):
         north = np.array([0.0, 1.0, 0.0])
         points = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, number], north], np.float32)
-        patches.append(turn(points, -float(heading)))  # seen along the robot's heading
+        patches.append(rotate_about_z(points, -float(heading)))  # seen along the robot's heading
     return PlaceSet(patches, area, xy_m, heading_rad)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.clouds.height_map import HeightMatcher, height_raster
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.config import CalibrationConfig, HeightMapConfig, PreprocessingConfig, VerificationConfig, from_dict
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.errors import ConfigError, EvaluationError
@@ -65,7 +65,7 @@ def towns() -> EvaluationSet:
     seen = []
     for place, aside, heading in zip(places, aside_m, headings, strict=False):
         moved = place - np.append(aside / HALF_M, 0.0).astype(np.float32)
-        seen.append(turn(moved + rng.normal(0.0, 0.002, moved.shape).astype(np.float32), -float(heading)))
+        seen.append(rotate_about_z(moved + rng.normal(0.0, 0.002, moved.shape).astype(np.float32), -float(heading)))
     return EvaluationSet(
         "towns",
         PlaceSet(seen, np.zeros(QUERIES, np.int64), xy_m[:QUERIES] + aside_m, headings),
@@ -160,7 +160,7 @@ def test_a_turned_query_is_the_same_place_in_another_heading(towns: EvaluationSe
     other = dataclasses.replace(
         towns,
         queries=PlaceSet(
-            [turn(np.asarray(patch), turned_by) for patch in queries.patches], queries.area, queries.xy_m,
+            [rotate_about_z(np.asarray(patch), turned_by) for patch in queries.patches], queries.area, queries.xy_m,
             queries.heading_rad - turned_by,
         ),
     )  # fmt: skip

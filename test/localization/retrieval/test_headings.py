@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
-from crossloc3d_ros.clouds.patch import turn
+from crossloc3d_ros.clouds.patch import rotate_about_z
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, heading_angles, search_headings
 from crossloc3d_ros.types import Float32Array
 
@@ -49,7 +49,7 @@ def test_encoder_without_headings_is_asked_once() -> None:
 def test_mean_over_turns_takes_the_heading_out() -> None:
     patch = _patch(np.random.default_rng(3))
     encoder = Compass(1, rotations=4)
-    first, second = (encode_query(encoder, turn(patch, angle)) for angle in (0.0, math.pi / 2))  # type: ignore[arg-type]
+    first, second = (encode_query(encoder, rotate_about_z(patch, angle)) for angle in (0.0, math.pi / 2))  # type: ignore[arg-type]
     np.testing.assert_allclose(first, second, atol=1e-6)
     np.testing.assert_allclose(first[0, :2], 0.0, atol=1e-6)
     assert first.shape == (1, 3)
@@ -59,7 +59,7 @@ def test_mean_over_turns_takes_the_heading_out() -> None:
 def test_heading_of_the_robot_comes_with_the_candidate(true_number: int) -> None:
     north_up = _patch(np.random.default_rng(1))
     angle = float(heading_angles(8)[true_number])
-    as_the_robot_sees_it = turn(north_up, -angle)
+    as_the_robot_sees_it = rotate_about_z(north_up, -angle)
     encoder = Compass(8)
     submaps = DescriptorMap(np.stack([encoder.encode(north_up), np.float32([9.0, 9.0, 9.0])]))
     ids, distances, numbers = search_headings(submaps, encode_query(encoder, as_the_robot_sees_it), 2)  # type: ignore[arg-type]
@@ -81,5 +81,5 @@ def test_search_is_the_minimum_over_the_headings_and_names_each_submap_once() ->
 
 def test_turn_goes_counter_clockwise_and_back() -> None:
     east = np.float32([[1.0, 0.0, 0.4]])
-    np.testing.assert_allclose(turn(east, math.pi / 2), [[0.0, 1.0, 0.4]], atol=1e-6)
-    np.testing.assert_allclose(turn(turn(east, 0.7), -0.7), east, atol=1e-6)
+    np.testing.assert_allclose(rotate_about_z(east, math.pi / 2), [[0.0, 1.0, 0.4]], atol=1e-6)
+    np.testing.assert_allclose(rotate_about_z(rotate_about_z(east, 0.7), -0.7), east, atol=1e-6)
