@@ -23,7 +23,7 @@ from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, ScanConfig, 
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet, join_places
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.simulated import scan_places, sources_digest
-from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.errors import EvaluationError, MapError
 from crossloc3d_ros.simulation import mesh, real_world, route, scene, vlp16, world
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
@@ -57,6 +57,22 @@ class AmsterdamBenchmark:
     scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
     sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
     build: BuildConfig = dataclasses.field(default_factory=BuildConfig)
+
+
+def find_surveys(folder: Path | None) -> Path:
+    """Return the folder with the two surveys: the given one, or the clone's `maps/amsterdam`; MapError otherwise."""
+    choices = (
+        [folder]
+        if folder is not None
+        else [Path("maps/amsterdam"), Path(__file__).resolve().parents[2] / "maps" / "amsterdam"]
+    )
+    for choice in choices:
+        if all((choice / name).is_file() for name in (MAP_SURVEY, DRIVE_SURVEY)):
+            return choice
+    raise MapError(
+        f"{choices[0]} does not hold {MAP_SURVEY} and {DRIVE_SURVEY}; run the demo in a clone of the repository, or "
+        "name their folder with --surveys"
+    )
 
 
 AMSTERDAM = AmsterdamBenchmark()

@@ -36,6 +36,22 @@ class OdometrySource:
     """Odometry of another frame is used with a warning: no TF is at hand that would relate the two."""
 
 
+@dataclass(frozen=True)
+class Ended:
+    """How the localizing of a recording ended."""
+
+    broken: BagError | None = None
+    """What was read before the damage is worth its figures."""
+    interrupted: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for readers of the results."""
+        if self.broken is not None:
+            return (f"The recording is damaged; only the part before the damage is shown. {self.broken}",)
+        return ("The run was interrupted; only the scans before that are shown.",) if self.interrupted else ()
+
+
 HELD_NS = 500_000_000
 """A scan waits so long in the recording for the odometry of its stamp."""
 
