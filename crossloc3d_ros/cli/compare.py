@@ -1,4 +1,4 @@
-"""`compare`: train the paper's competitors, or its ablations, in one way and budget, and examine them in one table."""
+"""`compare`: train the paper's competitors, or its ablations, in one way and budget, and evaluate them in one table."""
 
 from __future__ import annotations
 

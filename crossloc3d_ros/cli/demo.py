@@ -94,8 +94,8 @@ def _demo(arguments: argparse.Namespace) -> None:
             progress=lambda done, total, newest: display("play", done, total, f"scans; {_in_brief(newest)}"),
         )
     target.print(
-        f"{live.answers:,} answers to {live.scans:,} scans; the player was late by {live.play.late_median_ms:.1f} ms "
-        f"in the median, {live.play.late_p99_ms:.1f} ms at 99 %"
+        f"{live.answers:,} estimates for {live.scans:,} scans; the player was late by "
+        f"{live.play.late_median_ms:.1f} ms in the median, {live.play.late_p99_ms:.1f} ms at 99 %"
     )
 
     _headline(target, 4, "what came of it")
@@ -111,11 +111,11 @@ def _demo(arguments: argparse.Namespace) -> None:
     target.print(f"done in {time.monotonic() - begun:.0f} s")
 
 
-def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int, answers: int) -> About:
-    dropped = scans - answers
-    unanswered = [f"{dropped:,} scans got no answer (dropped or lost on the way); they count as misses."]
+def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int, estimates: int) -> About:
+    dropped = scans - estimates
+    unanswered = [f"{dropped:,} scans got no estimate (dropped or lost on the way); they count as misses."]
     return About(
-        title="A robot in Amsterdam, told where it is",
+        title="A robot in Amsterdam, localized",
         facts={
             "map": "AHN2, flown 2010",
             "drive": "simulated VLP-16 in AHN3, flown 2014",
@@ -142,7 +142,7 @@ def _about(arguments: argparse.Namespace, encoder: DescriptorEncoder, scans: int
 
 def _in_brief(newest: Estimate | None) -> str:
     if newest is None:
-        return "no answer yet"
+        return "no estimate yet"
     if newest.status is not FixStatus.FIX:
         return f"no fix, {newest.state.value}"
     return f"fix {newest.latitude_deg:.5f}, {newest.longitude_deg:.5f}"

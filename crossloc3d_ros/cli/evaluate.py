@@ -23,9 +23,9 @@ from crossloc3d_ros.evaluation.retrieval.predictions import HEADING_MODES, SETTI
 from crossloc3d_ros.evaluation.retrieval.report import CSV, JSON, PAGE, write_report
 from crossloc3d_ros.evaluation.retrieval.results import headline
 from crossloc3d_ros.evaluation.retrieval.runs import add_verified, read_predictions, replace_predictions
-from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import score
 from crossloc3d_ros.evaluation.retrieval.terminal import tables
+from crossloc3d_ros.training.handcrafted import ScanContext
 from crossloc3d_ros.types import DescriptorEncoder
 from crossloc3d_ros.workers import EncoderLoader
 
@@ -118,7 +118,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     if arguments.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
     if arguments.set:
-        raise ConfigError("--set changes the localizer, which --protocol place does not ask: add --protocol pose")
+        raise ConfigError("--set changes the localizer, which --protocol place does not evaluate: add --protocol pose")
     verification = _verification(arguments)
     loader = _loader(arguments)
     encoder = loader()

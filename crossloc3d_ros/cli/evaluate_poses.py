@@ -27,7 +27,7 @@ PREDICTIONS = "predictions.npz"
 
 
 def evaluate_poses(arguments: argparse.Namespace) -> None:
-    """Make the predictions that are asked for, score them, write and print the results."""
+    """Make the predictions, score them, write and print the results."""
     target = console()
     set_up_logging(arguments.verbose, target)
     _check(arguments)
@@ -64,7 +64,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.dataset is not None or arguments.method != "weights" or arguments.setting or arguments.query_headings:
         raise ConfigError("--protocol pose knows neither --dataset, --method, --setting nor --query-headings")
     if arguments.verify:
-        raise ConfigError("--verify orders the answers of --protocol place; the localizer of --protocol pose aligns")
+        raise ConfigError("--verify orders the places of --protocol place; the localizer of --protocol pose aligns")
 
 
 def _predict(arguments: argparse.Namespace, config: LocalizerConfig, path: Path, display: ProgressDisplay) -> None:

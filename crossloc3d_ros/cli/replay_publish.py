@@ -13,7 +13,7 @@ from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag
 
 
 def publish(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> None:
-    """Play the recording that is asked for and print how well its timing was kept."""
+    """Play the recording and print how well its timing was kept."""
     target = console()
     set_up_logging(arguments.verbose, target)
     try:

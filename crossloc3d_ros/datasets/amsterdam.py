@@ -40,19 +40,19 @@ Progress = Callable[[str, float, float, str], None]
 
 @dataclass(frozen=True)
 class AmsterdamBenchmark:
-    """How the real survey is examined."""
+    """How the real survey is evaluated."""
 
     drive_length_m: float = 600.0
     drive_speed_m_s: float = 5.0
     drive_seed: int = 3
     """Length, speed and seed are the demo's, so that it is the same drive."""
     drive_every_m: float = 5.0
-    """Between two scans asked."""
+    """Between two queries."""
     spread: int = 300
-    """Scans at places and in headings drawn by lot."""
+    """Scans at random places and in random headings."""
     spread_seed: int = 960_000
     border_m: float = 50.0
-    """The scans drawn by lot lie at least so far inside the survey of 2014."""
+    """The scans at random places lie at least so far inside the survey of 2014."""
     clearance_m: float = 1.5
     scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
     sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
@@ -159,7 +159,7 @@ def raw_drive(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
 
 
 def raw_spread(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
-    """Yield scans at places and in headings drawn by lot, with poses in the town's local frame."""
+    """Yield scans at random places and in random headings, with poses in the town's local frame."""
     rng = np.random.default_rng(benchmark.spread_seed)
     poses = town.sample_poses(benchmark.spread, rng, clearance_m=benchmark.clearance_m, border_m=benchmark.border_m)
     twists = np.zeros((len(poses), 6))

@@ -1,4 +1,4 @@
-"""The sets on which poses are fitted and examined: an aerial map, and raw scans with the true pose of each.
+"""The sets on which poses are fitted and evaluated: an aerial map, and raw scans with the true pose of each.
 
     pose_set = open_pose_set("simulated_small", Path("out/benchmark"), load_encoder)
     scan = pose_set.scans[0]
@@ -50,7 +50,7 @@ SEAM_M = 60.0
 _MOSAIC_ORIGIN = np.array([500_000.0, 5_800_000.0, 0.0])
 """South-western corner of every mosaic, EPSG:32631."""
 _TOWN_BEYOND_M, _BEYOND_FLOWN_M = 60.0, 20.0
-"""How far a simulated town goes on beyond the bounds that it is asked for; how much wider it is than what is flown."""
+"""How far a simulated town goes on beyond the bounds that are given; how much wider it is than what is flown."""
 
 Progress = Callable[[str, float, float, str], None]
 

@@ -2,7 +2,7 @@
 
 A row is a training run in a folder of its own, or a method without learning. Rows are done one after the other; what
 is done is kept, so a table that was stopped goes on where it was. Every row learns from the same places, by the same
-recipe and seed, and is examined on the same benchmark as `evaluate` does it: aerial database, random heading.
+recipe and seed, and is evaluated on the same benchmark as `evaluate` does it: aerial database, random heading.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
     save_predictions,
     way_of,
 )
-from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import difference, score
 from crossloc3d_ros.evaluation.statistics import Recall, Share, find_recall
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.handcrafted import HeightMaps, ScanContext
 from crossloc3d_ros.training.loop import Progress, Trainer
 from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.schedule import Budget
@@ -78,7 +78,7 @@ class Result:
     slug: str
     name: str
     encoder: str
-    """Fingerprint of what was examined."""
+    """Fingerprint of what was evaluated."""
     data: str
     """Fingerprint of the benchmark's set."""
     descriptor_size: int
@@ -145,10 +145,10 @@ def rows_of(table: TableName, base: TrainConfig) -> list[Row]:
             changed = dataclasses.replace(model, sub_steps=steps, memory_sizes=sizes_of_steps)
             variants.append((f"sub_steps_{steps}", f"{steps} sub-step{'s' * (steps > 1)} a grain", changed))
     elif table == "time_embedding":
-        for told in (False, True):
-            name = "with time embedding" if told else "without time embedding"
-            changed = dataclasses.replace(model, time_embedding=told)
-            variants.append((f"time_embedding_{'with' if told else 'without'}", name, changed))
+        for embedded in (False, True):
+            name = "with time embedding" if embedded else "without time embedding"
+            changed = dataclasses.replace(model, time_embedding=embedded)
+            variants.append((f"time_embedding_{'with' if embedded else 'without'}", name, changed))
     elif table == "position":
         names = {"none": "no position", "radial": "distance and height", "cartesian": "x, y and height"}
         variants = [
@@ -230,10 +230,10 @@ class Comparison:
     report: Callable[[str, Progress], None] = field(default=lambda slug, progress: None)
     encoding: Callable[[str, float, float, str], None] = field(default=lambda stage, done, total, unit: None)
     row_done: Callable[[list[Result]], None] = field(default=lambda results: None)
-    """Told the results so far after every row."""
+    """Called with the results so far after every row."""
 
     def run(self) -> list[Result]:
-        """Train and examine every row that is not done; return all results in the rows' order.
+        """Train and evaluate every row that is not done; return all results in the rows' order.
 
         A row that fails is left out and does not stop the others; when all are through it is raised as TrainingError.
         A row that was trained with other settings or on other places is refused.

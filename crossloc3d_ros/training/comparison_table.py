@@ -143,7 +143,7 @@ def _notes(results: Sequence[Result]) -> list[str]:
     recalls = [results[0].recall(rank, radius) for radius in RADII_M for rank in RANKS]
     chances = ", ".join(f"{r.label} {r.radius_m:.0f} m {100 * r.chance:.1f} %" for r in recalls)
     return [
-        f"Recall in per cent with its 95 % interval; by lot: {chances}.",
+        f"Recall in per cent with its 95 % interval; chance level: {chances}.",
         "Milliseconds: the median to encode one query in all the headings that the method tries, on the CPU, and to "
         "search the whole database; other work on the machine makes them longer.",
         "Against the reference: difference of R@1 at 100 m on the same queries in points; an interval without 0 says "

@@ -119,7 +119,7 @@ def fit_calibration(descriptor_distances: Float64Array, metres: Float64Array) ->
     """Fit what the localizer believes to the same matrices.
 
     Every query counts twice: against the whole database, and against the database without its own town. The second
-    is a robot outside of the map, which must learn to be told so.
+    is a robot outside of the map, for which low beliefs must be learned.
     """
     distances, separations_m = [], []
     for near, apart in zip(descriptor_distances, metres, strict=True):

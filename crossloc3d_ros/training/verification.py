@@ -19,8 +19,8 @@ from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 RIGHT_M = 25.0
-"""An answer is right within this."""
-_NEAREST_COUNT = 1e-3  # pull of both logarithms towards 0: keeps them finite where one distance tells everything
+"""A place is right within this."""
+_NEAREST_COUNT = 1e-3  # pull of both logarithms towards 0: keeps them finite where one distance decides everything
 
 Progress = Callable[[str, float, float, str], None]
 
@@ -45,14 +45,14 @@ class FittedVerification:
 def fit_verification(
     towns: Sequence[ValidationTown], job: EncodingJob, candidates: int, threads: int = 1
 ) -> FittedVerification:
-    """Search for the queries of held-out towns in all of them as `evaluate` does, and fit the weight to the answers.
+    """Retrieve the queries of held-out towns among all of them as `evaluate` does, and fit the weight to the places.
 
-    `candidates` is how many answers of each query are compared. Raises TrainingError where there are fewer than two
-    towns, or no query has a right place among its answers and a wrong one; EvaluationError where the encoder carries no
+    `candidates` is how many places of each query are compared. Raises TrainingError where there are fewer than two
+    towns, or no query has a right place among those found and a wrong one; EvaluationError where the encoder carries no
     calibration.
     """
     if len(towns) < 2:
-        raise TrainingError("the weight of height maps is examined on one town at a time: at least two are needed")
+        raise TrainingError("the weight of height maps is evaluated on one town at a time: at least two are needed")
     places = evaluation_set_of(towns)
     temperature, half_extent_m = temperature_of(job.encoder), job.encoder.preprocessing.half_extent_m
     count, way = way_of(job.encoder)
@@ -83,17 +83,17 @@ def fit_verification(
 
 
 def fit_weight(distances: Float32Array, fits: Float32Array, temperature: float, right: BoolArray) -> float:
-    """Return the weight under which the right answers are likeliest, for `evaluation.verification.scores_of`.
+    """Return the weight under which the right places are likeliest, for `evaluation.verification.scores_of`.
 
-    `distances` and `fits` (Q, N) are those of descriptors and of height maps. An answer's odds fall by
+    `distances` and `fits` (Q, N) are those of descriptors and of height maps. A place's odds fall by
     exp(-a d / temperature - b m), as in a conditional logit; a and b are those of the greatest likelihood, the weight
     is b / a.
-    Queries without a right answer, or without a wrong one, or that show nothing, teach nothing; TrainingError where no
+    Queries without a right place, or without a wrong one, or that show nothing, teach nothing; TrainingError where no
     other is left.
     """
     taught = right.any(axis=1) & ~right.all(axis=1) & np.isfinite(fits).all(axis=1)
     if not taught.any():
-        raise TrainingError("no query has a right and a wrong place among its answers: nothing to learn from")
+        raise TrainingError("no query has a right and a wrong place among those found: nothing to learn from")
     learned, seen, hits = distances[taught] / np.float64(temperature), fits[taught].astype(np.float64), right[taught]
     unit = float(np.mean(seen.std(axis=1))) or 1.0  # so that both parameters are of the order of 1
 

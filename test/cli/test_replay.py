@@ -85,7 +85,7 @@ def test_results_are_written_and_said(results: tuple[Path, str], town_drive) -> 
     assert summary["scans"] == len(rows)
     assert json.loads((folder / "estimates.geojson").read_text())["type"] == "FeatureCollection"
     assert "/gnss" in (folder / "index.html").read_text()
-    for word in (str(folder / "index.html"), "AR@1", "AR@5", "AR@25", "within 25 m", "by lot", "error of"):
+    for word in (str(folder / "index.html"), "AR@1", "AR@5", "AR@25", "within 25 m", "chance", "error of"):
         assert word in said
 
 

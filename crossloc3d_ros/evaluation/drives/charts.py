@@ -25,7 +25,7 @@ WORST = "wrong"
 _WIDE = 1160.0
 _LOW_M = 0.02
 _STATE_HOLDS_S = 2.0
-"""So long a state is drawn on after the scan that told it, where no other scan tells one."""
+"""So long a state is drawn on after the scan that set it, where no other scan sets one."""
 _STEPS = ("prepare", "encode", "search", "align", "fuse")
 STATE_WORDS = {
     TrackState.SEARCHING: "searching",

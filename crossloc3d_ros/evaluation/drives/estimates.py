@@ -152,7 +152,7 @@ class EstimateTable:
     truth_heading_rad: Float64Array
     """(S,) counter-clockwise from true east; NaN where unknown."""
     states: tuple[TrackState | None, ...]
-    """(S,); None where the file does not say, and for scans that got no answer or could not be used."""
+    """(S,); None where the file does not say, and for scans that got no estimate or could not be used."""
     probability: Float64Array
     """(S,) belief that the horizontal error is below 10 m; NaN where the file does not say."""
     heading_rad: Float64Array
@@ -241,7 +241,7 @@ class EstimateWriter:
             _number(estimate.altitude_m, 3),
             *(_number(value, 3) for value in estimate.grid),
             *(_number(value, 4) for value in covariance),
-            # A scan that was dropped, or could not be used, has changed nothing: the state is not its to tell.
+            # A scan that was dropped, or could not be used, has changed nothing: the state is not its own.
             estimate.state.value if math.isfinite(estimate.probability) else "",
             _number(estimate.probability, 6),
             _number(math.degrees(heading_of(estimate.T_map_base)), 4),

@@ -42,7 +42,7 @@ class Evaluation:
     track: TrackScores | None = None
     """None where the estimates are places and no poses, or nothing is known of the truth."""
     heading_topic: str | None = None
-    """What tells the true headings; None where nothing does."""
+    """What measures the true headings; None where nothing does."""
 
 
 def evaluate(bag: BagReader, folder: Path, aerial_map: AerialMap, gnss_topic: str | None = None) -> Evaluation:

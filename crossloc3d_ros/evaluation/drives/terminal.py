@@ -46,7 +46,7 @@ def result_tables(evaluation: Evaluation) -> list[Table]:
         recall.add_column(f"within {radius:g} m", justify="right", no_wrap=True)
     for rank in RANKS:
         cells = [scores.recall(rank, radius) for radius in RADII_M]
-        recall.add_row(f"AR@{rank}", *(f"{cell.share.value:.0%} (by lot {cell.chance:.0%})" for cell in cells))
+        recall.add_row(f"AR@{rank}", *(f"{cell.share.value:.0%} (chance {cell.chance:.0%})" for cell in cells))
     return [figures, recall]
 
 

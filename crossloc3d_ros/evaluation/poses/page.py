@@ -65,7 +65,7 @@ def _verdict(scores: PoseScores) -> str:
         else f"driving, a fix comes after <b>{shown(until)}</b> in the median, and is good to <b>{shown(after)}</b>"
     )
     return (
-        f"One scan alone tells the pose to {WITHIN_M:g} m and {WITHIN_DEG:g}° in <b>{shown(one)}</b> of "
+        f"One scan alone gives the pose to {WITHIN_M:g} m and {WITHIN_DEG:g}° in <b>{shown(one)}</b> of "
         f"{one.count:,} cases on a map of {scores.about.map_km2:.1f} km²; {moved}. "
         f"Of {wrong.count:,} fixes, <b>{shown(wrong)}</b> are wrong by more than {WRONG_M:g} m. "
         f"{counts['goal']} of {sum(counts.values())} rows reach their goal, {counts['floor']} their floor alone, "
@@ -188,7 +188,7 @@ def _belief_tables(scores: PoseScores) -> str:
 
 
 def _fine_percent(share: float) -> str:
-    """Return a share with the digits that tell 99.9 from 99.99 %."""
+    """Return a share with the digits that distinguish 99.9 from 99.99 %."""
     return f"{100 * share:.3g} %" if share < 0.99 else f"{100 * share:.2f} %"
 
 
@@ -210,22 +210,22 @@ def _families(measures: Sequence[Measure]) -> str:
 
 def _words(scores: PoseScores, words: Sequence[str]) -> str:
     paragraphs = [
-        "<h3>One scan</h3><p>Each scan is asked from nothing: no pose before, no heading, no odometry. Its answer is "
-        "the pose that fits best, whether or not it is believed; a scan without an answer counts as wrong. The true "
-        f"place is among the candidates where the centre of one of the 25 lies within {AMONG_M:g} m of the robot.</p>",
+        "<h3>One scan</h3><p>Each scan is localized from nothing: no pose before, no heading, no odometry. Its "
+        "prediction is the pose that fits best, whether or not it is believed; a scan without a pose counts as wrong. "
+        f"The true place is among the candidates where the centre of one of the 25 lies within {AMONG_M:g} m of the robot.</p>",
         f"<h3>Drives</h3><p>Localized is a robot at its first fix that is right to {WRONG_M:g} m; a drive on which "
         "that does not happen counts as infinitely long (∞). Errors afterwards are those of all fixes from then on, "
-        "right ones and wrong ones. Then it is carried to another town while its wheels stand still, and nobody tells "
-        "it. Wrong fixes are counted over everything: before, afterwards, while carried, and off the map, where every "
+        "right ones and wrong ones. Then it is kidnapped: moved to another town while its wheels stand still. "
+        "Wrong fixes are counted over everything: before, afterwards, while kidnapped, and off the map, where every "
         "fix is wrong.</p>",
         "<h3>Two sigma</h3><p>The ellipse of the stated covariance that holds 95.4 % of an honest estimate's errors. "
         "The dashed lines are what honest covariances would show.</p>",
         "<h3>Stages</h3><p>“Retrieval alone” is the first candidate's centre, which has no heading. “+ alignment” is "
         "the best pose within 50 m of the foremost candidate that has one, “+ re-ranking” the best of all. "
-        "Along drives the same scans, each fifth, are asked alone and with all that came before.</p>",
-        "<h3>Intervals</h3><p>Scans of one town are alike, so towns, not scans, are drawn by lot with replacement; "
-        "where fewer than eight were asked, squares of 50 m stand in for them. The interval holds 95 % of these draws, "
-        "for shares widened to hold Wilson's for as many trials as there are places at least 25 m apart.</p>",
+        "Along drives the same scans, each fifth, are localized alone and with all that came before.</p>",
+        "<h3>Intervals</h3><p>Scans of one town are alike, so towns, not scans, are resampled with replacement; "
+        "where fewer than eight were evaluated, squares of 50 m stand in for them. The interval holds 95 % of these "
+        "draws, for shares widened to hold Wilson's for as many trials as there are places at least 25 m apart.</p>",
         *(f"<p>{escape(sentence)}</p>" for sentence in words),
     ]
     return "".join(paragraphs)

@@ -1,4 +1,4 @@
-"""From answers to the figures of the pose benchmark: pure functions over `PosePredictions`.
+"""From predictions to the figures of the pose benchmark: pure functions over `PosePredictions`.
 
 What is counted is said at each measure. Intervals are those of `statistics`.
 """
@@ -47,7 +47,7 @@ class Measure:
     text: str
     unit: Unit
     value: float
-    """A share lies between 0 and 1; infinite: not within the drive; NaN: nothing was asked."""
+    """A share lies between 0 and 1; infinite: not within the drive; NaN: nothing was counted."""
     low: float
     high: float
     count: int
@@ -80,7 +80,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Stage:
-    """What the answers are worth up to one stage of the chain, on the same scans."""
+    """What the poses are worth up to one stage of the chain, on the same scans."""
 
     name: str
     scans: int
@@ -123,7 +123,7 @@ class PoseScores:
     """(41,) share of the errors inside of k sigma, k in `SIGMAS`, by what they are errors of."""
     errors_m: dict[str, Float64Array]
     """Horizontal errors of the single scans by stage, and of the fixes along drives; infinite where there is no
-    answer."""
+    pose."""
 
     def measure(self, key: str) -> Measure:
         """Return one figure."""
@@ -141,24 +141,24 @@ def score_poses(predictions: PosePredictions, about: PoseAbout) -> PoseScores:
     singles = select(predictions, single & on_map)
     track = select(predictions, driven & on_map)
     away = select(predictions, (driven | single) & ~on_map)
-    asked = select(predictions, driven | single)
+    evaluated = select(predictions, driven | single)
     after = select(track, localized_before(track) & track.has_fix)
     goals = _goals(about)
     measures = (
         *_single_measures(singles, goals),
         *_way_measures(track, goals),
         *_after_measures(track, after, goals),
-        _wrong_measure(asked, goals),
+        _wrong_measure(evaluated, goals),
         _sigma_measure(after, goals),
         *_away_measures(away, select(away, away.journey >= 0), goals),
         *_time_measures(predictions),
     )
-    stages = {name: answer(singles) for name, answer in STAGES.items()}
-    fused = {"single, " + name: _distance(singles, answer) for name, answer in stages.items()}
+    stages = {name: pose(singles) for name, pose in STAGES.items()}
+    fused = {"single, " + name: _distance(singles, pose) for name, pose in stages.items()}
     return PoseScores(
         about=about,
         measures=measures,
-        stages=tuple(_stage(name, singles, answer) for name, answer in stages.items()),
+        stages=tuple(_stage(name, singles, pose) for name, pose in stages.items()),
         drive_stages=_drive_stages(predictions, on_map),
         families=_family_measures(singles, about),
         calibrations=_calibrations(singles, track, away),
@@ -177,21 +177,21 @@ def error_deg(predictions: PosePredictions) -> Float64Array:
     return _turn_deg(predictions, predictions.pose[:, [0, 1, 3]])
 
 
-def _distance(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
-    metres = np.hypot(answer[:, 0] - predictions.truth[:, 0], answer[:, 1] - predictions.truth[:, 1])
+def _distance(predictions: PosePredictions, pose: Float64Array) -> Float64Array:
+    metres = np.hypot(pose[:, 0] - predictions.truth[:, 0], pose[:, 1] - predictions.truth[:, 1])
     return np.where(np.isfinite(metres), metres, np.inf)
 
 
-def _turn_deg(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
-    turn = answer[:, 2] - predictions.truth[:, 3]
+def _turn_deg(predictions: PosePredictions, pose: Float64Array) -> Float64Array:
+    turn = pose[:, 2] - predictions.truth[:, 3]
     degrees = np.degrees(np.abs(np.arctan2(np.sin(turn), np.cos(turn))))
     return np.where(np.isfinite(degrees), degrees, np.inf)
 
 
-def is_right(predictions: PosePredictions, answer: Float64Array) -> BoolArray:
-    """Say (N,) of answers (N, 3) easting, northing, heading whether they are within 2 m and 5 degrees."""
-    near = _distance(predictions, answer) <= WITHIN_M
-    return np.asarray(near & (_turn_deg(predictions, answer) <= WITHIN_DEG), np.bool_)
+def is_right(predictions: PosePredictions, pose: Float64Array) -> BoolArray:
+    """Say (N,) of poses (N, 3) easting, northing, heading whether they are within 2 m and 5 degrees."""
+    near = _distance(predictions, pose) <= WITHIN_M
+    return np.asarray(near & (_turn_deg(predictions, pose) <= WITHIN_DEG), np.bool_)
 
 
 def retrieved(predictions: PosePredictions) -> Float64Array:
@@ -204,13 +204,13 @@ def first_aligned(predictions: PosePredictions) -> Float64Array:
     """Return the best pose (N, 3) within 50 m of the foremost candidate that has one so near."""
     source = predictions.aligned_source
     own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == WHOLE_MAP))
-    answer = np.full((len(predictions), 3), np.nan)
+    pose = np.full((len(predictions), 3), np.nan)
     for place in np.moveaxis(predictions.candidates, 1, 0)[::-1]:  # the foremost last: it has the last word
         offsets = predictions.aligned[:, :, :2] - place[:, None, :]
         near = own & (np.hypot(offsets[:, :, 0], offsets[:, :, 1]) <= AMONG_M)
         has = near.any(axis=1)
-        answer[has] = predictions.aligned[has, near[has].argmax(axis=1)]
-    return answer
+        pose[has] = predictions.aligned[has, near[has].argmax(axis=1)]
+    return pose
 
 
 def best_aligned(predictions: PosePredictions) -> Float64Array:
@@ -326,11 +326,11 @@ def _way_measures(track: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
     legs = _legs(track)
     right = track.has_fix & (error_m(track) <= WRONG_M)
     measures = []
-    for key, text, carried in (
+    for key, text, kidnapped in (
         ("until", "travelled until localized, from nothing", False),
-        ("carried", "carried away while running: recovered after", True),
+        ("carried", "kidnapped while running: recovered after", True),
     ):
-        chosen = [rows for rows in legs if (track.leg[rows[0]] > 0) == carried]
+        chosen = [rows for rows in legs if (track.leg[rows[0]] > 0) == kidnapped]
         ways = np.array([track.travelled_m[rows[right[rows].argmax()]] if right[rows].any() else np.inf
                          for rows in chosen])  # fmt: skip
         first = select(track, np.array([rows[0] for rows in chosen], np.int64))
@@ -353,8 +353,8 @@ def _after_measures(track: PosePredictions, after: PosePredictions, goals: _Goal
     )
 
 
-def _wrong_measure(asked: PosePredictions, goals: _Goals) -> Measure:
-    fixes = select(asked, asked.has_fix)
+def _wrong_measure(evaluated: PosePredictions, goals: _Goals) -> Measure:
+    fixes = select(evaluated, evaluated.has_fix)
     return _share("wrong", f"fixes that are wrong by more than {WRONG_M:g} m", error_m(fixes) > WRONG_M, fixes,
                   "fixes", goals)  # fmt: skip
 
@@ -385,16 +385,16 @@ def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
     )
 
 
-def _stage(name: str, of: PosePredictions, answer: Float64Array) -> Stage:
-    metres = _distance(of, answer)
-    share = clustered_share(is_right(of, answer), _clusters(of), _places(of))
+def _stage(name: str, of: PosePredictions, pose: Float64Array) -> Stage:
+    metres = _distance(of, pose)
+    share = clustered_share(is_right(of, pose), _clusters(of), _places(of))
     middle = float(np.median(metres)) if len(metres) else math.nan
     near, far = (float(np.mean(metres <= radius)) if len(metres) else math.nan for radius in (10.0, 50.0))
     return Stage(name, len(of), share.value, share.low, share.high, near, far, middle)
 
 
 def _drive_stages(predictions: PosePredictions, on_map: BoolArray) -> tuple[Stage, ...]:
-    """Compare scans of drives that were asked alone with what the track says at the same moment."""
+    """Compare scans of drives that were localized alone with the estimate along the drive at the same moment."""
     number = number_of_alone(predictions)
     alone = np.flatnonzero((number >= 0) & on_map)
     at = {
@@ -407,7 +407,7 @@ def _drive_stages(predictions: PosePredictions, on_map: BoolArray) -> tuple[Stag
         return ()
     lonely = select(predictions, np.array([pair[0] for pair in pairs], np.int64))
     tracked = select(predictions, np.array([pair[1] for pair in pairs], np.int64))
-    stages = [_stage(name, lonely, answer(lonely)) for name, answer in STAGES.items()]
+    stages = [_stage(name, lonely, pose(lonely)) for name, pose in STAGES.items()]
     stages.append(_stage("+ fusion, from the first scan on", tracked, tracked.pose[:, [0, 1, 3]]))
     fixed = select(tracked, tracked.has_fix)
     stages.append(_stage("+ fusion, where a fix is given", fixed, fixed.pose[:, [0, 1, 3]]))

@@ -74,7 +74,7 @@ def describe(about: About) -> str:
 
 
 def describe_briefly(about: About) -> str:
-    """Return the same for narrow tables, in which verified answers follow those that they are made of."""
+    """Return the same for narrow tables, in which verified predictions follow those that they are made of."""
     if about.verified:
         return f"  + {about.verified} height maps"
     heading = "north" if about.heading == "aligned" else "random"
@@ -89,10 +89,10 @@ def _page_file(name: str) -> str:
 def _verdict(main: Scores) -> str:
     best, near = main.overall.recall("R@1", 100.0), main.overall.recall("R@1", 25.0)
     return (
-        f"Asked for the place of <b>{main.overall.queries:,}</b> ground scans among "
+        f"For <b>{main.overall.queries:,}</b> ground scans, queried among "
         f"<b>{main.about.database:,}</b> places ({escape(describe(main.about))}), <b>{escape(main.about.weights)}</b> "
         f"names one within 100 m first in <b>{percent(best.share.value, 1)}</b> of the cases (95 % interval "
-        f"{interval(best.share)}, by lot {percent(best.chance, 1)}), one within 25 m in "
+        f"{interval(best.share)}, chance level {percent(best.chance, 1)}), one within 25 m in "
         f"<b>{percent(near.share.value, 1)}</b>."
     )
 
@@ -100,14 +100,18 @@ def _verdict(main: Scores) -> str:
 def _tiles(main: Scores) -> str:
     tiles = []
     for label, radius, what in (
-        ("R@1", 100.0, "First answer within 100 m"),
-        ("R@1", 25.0, "First answer within 25 m"),
+        ("R@1", 100.0, "First place within 100 m"),
+        ("R@1", 25.0, "First place within 25 m"),
         ("R@25", 100.0, "Within 100 m among 25"),
         ("R@1%", 100.0, "In the first per cent"),
     ):
         figure = main.overall.recall(label, radius)
         tiles.append(
-            (what, percent(figure.share.value, 1), f"{interval(figure.share)}; by lot {percent(figure.chance, 1)}")
+            (
+                what,
+                percent(figure.share.value, 1),
+                f"{interval(figure.share)}; chance level {percent(figure.chance, 1)}",
+            )
         )
     about = main.about
     once = "one descriptor" if about.query_headings == 1 else f"{about.query_headings} descriptors"
@@ -132,7 +136,7 @@ def _recall_table(scores: Sequence[Scores], main: Scores, radius_m: float) -> st
         note = f"<small>{counted:,} queries, {each.about.database:,} places; by {each.about.kind}</small>"
         rows.append(f"<tr{css}><th scope='row'>{escape(describe(each.about))}{note}</th>{cells}</tr>")
     return (
-        f'<div class="scroll"><table class="recall"><caption>An answer counts within {radius_m:g} m</caption>'
+        f'<div class="scroll"><table class="recall"><caption>A place counts within {radius_m:g} m</caption>'
         f'<thead><tr><th scope="col">database and heading</th>{head}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
@@ -145,7 +149,7 @@ def _cell(figure: Recall) -> str:
         f"<td><b>{percent(figure.share.value, 1)}</b>"
         f'<div class="gauge"><i style="width:{100 * figure.share.value:.1f}%"></i>'
         f'<s style="left:{100 * figure.chance:.1f}%"></s></div>'
-        f"<small>{interval(figure.share)}</small><small>by lot {percent(figure.chance, 1)}</small></td>"
+        f"<small>{interval(figure.share)}</small><small>chance level {percent(figure.chance, 1)}</small></td>"
     )
 
 
@@ -157,9 +161,9 @@ def _lines(scores: Sequence[Scores], main: Scores) -> list[Scores]:
 def _curve_chart(scores: Sequence[Scores], main: Scores, radius_m: float) -> str:
     ticks = [(float(n), str(n)) for n in (1, 2, 5, 10, 25, 50, 100)]
     chart = charts.Chart(
-        charts.Axis(1.0, float(CURVE), "answers looked at, N", ticks, log=True),
+        charts.Axis(1.0, float(CURVE), "places retrieved, N", ticks, log=True),
         charts.share_axis(f"AR@N within {radius_m:g} m"),
-        f"Average recall within {radius_m:g} metres over the number of answers",
+        f"Average recall within {radius_m:g} metres over the number of places retrieved",
         height=330.0,
     )
     ranks = np.arange(1.0, CURVE + 1)
@@ -181,7 +185,7 @@ def _curve_legend(scores: Sequence[Scores], main: Scores) -> str:
     )
     left = len(scores) - len(_lines(scores, main))
     more = f"<span>{left} more are in the tables alone.</span>" if left else ""
-    return f'<p class="below">{keys}<span><i class="key stroke lot"></i>drawn by lot, each database</span>{more}</p>'
+    return f'<p class="below">{keys}<span><i class="key stroke lot"></i>chance level, each database</span>{more}</p>'
 
 
 def _gallery(pictures: tuple[list[Row], list[Row]], main: Scores, width_m: float) -> str:
@@ -190,18 +194,18 @@ def _gallery(pictures: tuple[list[Row], list[Row]], main: Scores, width_m: float
     reached = int((main.first_m <= 100.0).sum())
     text = (
         f"<p>Clouds seen from above, {width_m:g} m wide, north up; brighter is higher. Left the scan, beside it the "
-        f"first {TOP} answers with their distance from the robot: framed green within 100 m, red beyond. The scan is "
-        "drawn north up only so that eyes can compare. Shown are queries drawn by lot with a "
-        f"fixed seed, {len(right)} of the {reached:,} whose first answer is right and {len(wrong)} of the "
+        f"first {TOP} places with their distance from the robot: framed green within 100 m, red beyond. The scan is "
+        "drawn north up only so that eyes can compare. Shown are queries chosen at random with a "
+        f"fixed seed, {len(right)} of the {reached:,} whose first place is right and {len(wrong)} of the "
         f"{main.overall.queries - reached:,} where it is wrong: half and half here, {percent(share.share.value, 1)} "
         "right in truth.</p>"
     )
     parts = [text]
-    for title, rows in (("The first answer is right", right), ("The first answer is wrong", wrong)):
+    for title, rows in (("The first place is right", right), ("The first place is wrong", wrong)):
         if not rows:
             continue
         head = "".join(f'<div class="head">{name}</div>' for name in ("scan", *(f"{i + 1}." for i in range(TOP))))
-        cells = "".join(_figure(picture) for row in rows for picture in (row.query, *row.answers))
+        cells = "".join(_figure(picture) for row in rows for picture in (row.query, *row.retrieved))
         parts.append(f'<h3>{title}</h3><div class="gallery">{head}{cells}</div>')
     return "".join(parts)
 
@@ -209,7 +213,7 @@ def _gallery(pictures: tuple[list[Row], list[Row]], main: Scores, width_m: float
 def _figure(picture: Picture) -> str:
     css = "query" if picture.right is None else "right" if picture.right else "miss"
     mark = "" if picture.right is None else "✓ " if picture.right else "✗ "
-    alt = "scan" if picture.right is None else "right answer" if picture.right else "wrong answer"
+    alt = "scan" if picture.right is None else "right place" if picture.right else "wrong place"
     return (
         f'<figure class="{css}"><img src="{picture.data_uri}" alt="{alt}, {escape(picture.caption)}">'
         f"<figcaption>{mark}{escape(picture.caption)}</figcaption></figure>"
@@ -242,18 +246,19 @@ def _divided_row(group: GroupScores, columns: Sequence[tuple[str, float]], css: 
 def _words(scores: Sequence[Scores], main: Scores, texts: PageTexts) -> str:
     one_per_cent = main.overall.recall("R@1%", 100.0).rank
     paragraphs = [
-        "<h3>Recall</h3><p>R@N within a radius is the share of queries for which one of the first N answers is centred "
+        "<h3>Recall</h3><p>R@N within a radius is the share of queries for which one of the first N places is centred "
         "within the radius of the true place. Queries without any place of the database within the radius cannot be "
-        "answered and do not count, as in the released evaluators. The tick on each bar is what as many different "
-        "places drawn by lot would reach: figures of databases of different size, or of different spacing, cannot be "
+        "answered and do not count, as in the released evaluators. The tick on each bar is the chance level, what as "
+        "many different places drawn at random would reach: figures of databases of different size, or of different "
+        "spacing, cannot be "
         "compared without it.</p>",
-        f"<h3>Two one per cents</h3><p>R@1% looks at {one_per_cent:,} answers here, one per cent of "
+        f"<h3>Two one per cents</h3><p>R@1% counts {one_per_cent:,} places here, one per cent of "
         f"{main.about.database:,} places. What was published as AR@1% for CS-Campus3D is R@25: the released evaluators "
-        "retrieve 25 answers, whatever the size of the database. Both are given.</p>",
+        "retrieve 25 places, whatever the size of the database. Both are given.</p>",
         "<h3>Headings</h3><p>“North-aligned” turns each query to north by its true heading, as a perfect compass "
         "would. “Random heading” leaves it as the robot stood. Submaps always lie north up.</p>",
-        "<h3>Intervals</h3><p>Queries of one town are alike, so towns, not queries, are drawn by lot with replacement "
-        "2,000 times; where fewer than eight towns were asked, squares of 50 m stand in for them. The interval holds "
+        "<h3>Intervals</h3><p>Queries of one town are alike, so towns, not queries, are resampled with replacement "
+        "2,000 times; where fewer than eight towns were queried, squares of 50 m stand in for them. The interval holds "
         "95 % of these draws and is widened to hold Wilson's interval for as many trials as there are places at least "
         "25 m apart.</p>",
         *_verification_words(scores),
@@ -269,7 +274,7 @@ def _verification_words(scores: Sequence[Scores]) -> list[str]:
         return []
     return [
         f"<h3>Height maps</h3><p>“Retrieval” orders all places by their descriptors. “{escape(about.kind)}” compares "
-        f"the scan's height map with those of the first {about.verified:,} answers, in every heading and at the offset "
+        f"the scan's height map with those of the first {about.verified:,} places, in every heading and at the offset "
         "that fits best, and orders these anew by both distances; those behind keep their order. The distance of the "
         "descriptors counts in units of the weights' calibration (its temperature), that of the height maps (square "
         f"roots of heights, in patch units) with the weight {about.verification_weight:g}, fitted on other towns. "
@@ -282,8 +287,8 @@ def _heading_words(main: Scores) -> list[str]:
         return []
     errors = main.heading
     return [
-        f"<h3>The heading that comes with an answer</h3><p>Each query was tried every {errors.step_deg:g} degrees. Of "
-        f"the {errors.queries:,} first answers within 100 m, the heading in which the query lay nearest was off by "
+        f"<h3>The heading that comes with a place</h3><p>Each query was tried every {errors.step_deg:g} degrees. Of "
+        f"the {errors.queries:,} first places within 100 m, the heading in which the query lay nearest was off by "
         f"{errors.median_deg:.0f} degrees in the median, and by at most one step in "
         f"{percent(errors.within_step, 1)}.</p>"
     ]

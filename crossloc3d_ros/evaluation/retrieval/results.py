@@ -28,7 +28,7 @@ def label_of(recall: Recall) -> str:
 def headline(scores: Sequence[Scores], query_headings: int, way: Way) -> Scores:
     """Return the scores that stand for the method: aerial, random heading, queries tried as the localizer does it.
 
-    Where that was not asked for, aerial and aligned, or the first. Verified answers where there are any.
+    Where there is none such, aerial and aligned, or the first. Verified predictions where there are any.
     """
     verified_first = sorted(scores, key=lambda each: -each.about.verified)
     for wanted in (("aerial", "random"), ("aerial", "aligned")):

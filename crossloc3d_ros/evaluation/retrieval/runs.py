@@ -43,7 +43,7 @@ def add_verified(
             (folder / f"{made.about.name}.npz").unlink(missing_ok=True)
     retrieved = [made for made in stored if made.about.setting == "aerial" and not made.about.verified]
     if not retrieved:
-        raise ConfigError("--verify orders answers among aerial submaps alone: add --setting aerial")
+        raise ConfigError("--verify orders aerial submaps alone: add --setting aerial")
     for made in retrieved:
         verified = verify(made, evaluation_set, encoder, config, threads=threads, progress=progress)
         save_predictions(folder / f"{verified.about.name}.npz", verified)

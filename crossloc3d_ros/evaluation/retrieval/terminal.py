@@ -30,12 +30,12 @@ def tables(scores: Sequence[Scores], main_scores: Scores) -> list[Table]:
                 *(percent(figure.share.value, 1, unit="") for figure in others),
             )
         shown.append(table)
-    notes = ["* published as AR@1%: the released evaluators retrieve 25 answers"]
+    notes = ["* published as AR@1%: the released evaluators retrieve 25 places"]
     if any(each.about.query_headings > 1 for each in scores):
         notes.append("8 nearest: tried in 8 headings, the nearest kept; 8 mean: by the mean of their descriptors")
     again = max(each.about.verified for each in scores)
     if again:
-        notes.append(f"+ {again} height maps: so many answers ordered by retrieval + height maps; else by retrieval")
+        notes.append(f"+ {again} height maps: so many places ordered by retrieval + height maps; else by retrieval")
     shown[-1].caption = "\n".join(notes)
     divided = plain_table(
         f"{describe(main_scores.about)}, %", ["", "queries", *(f"R@1 {r:g} m" for r in RADII_M), "R@25 100 m"]
