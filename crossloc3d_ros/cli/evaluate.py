@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
-from crossloc3d_ros.cli.evaluate_poses import evaluate_poses, label_of, loader_of
+from crossloc3d_ros.cli.modes.evaluate_poses import evaluate_poses, label_of, loader_of
 from crossloc3d_ros.config import VerificationConfig, from_dict
 from crossloc3d_ros.datasets.amsterdam import find_surveys
 from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark

@@ -23,7 +23,7 @@ from crossloc3d_ros.cli.common import (
     run,
     set_up_logging,
 )
-from crossloc3d_ros.cli.replay_publish import publish
+from crossloc3d_ros.cli.modes.replay_publish import publish
 from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig
 from crossloc3d_ros.config.sources import read_node_config
 from crossloc3d_ros.datasets.truth import find_truth_topic

@@ -26,18 +26,15 @@ from crossloc3d_ros.config import MountingConfig
 from crossloc3d_ros.datasets import amsterdam
 from crossloc3d_ros.datasets import benchmarks as benchmark
 from crossloc3d_ros.datasets.amsterdam import AmsterdamBenchmark
+from crossloc3d_ros.datasets.made import how_made, is_made, mark_made, whole
 from crossloc3d_ros.datasets.pose_sets import (
     AWAY,
     POSE_SETS,
     PoseSet,
     Progress,
     SimulatedPoses,
-    how_made,
-    is_made,
-    mark_made,
     placed_town,
     to_grid,
-    whole,
 )
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
 from crossloc3d_ros.datasets.simulated import sources_digest

@@ -17,8 +17,8 @@ from crossloc3d_ros.evaluation.drives.estimates import (
     EstimateTable,
     add_truth,
     read_estimates,
-    write_geojson,
 )
+from crossloc3d_ros.evaluation.drives.geojson import write_geojson
 from crossloc3d_ros.evaluation.drives.place_scores import Scores, score
 from crossloc3d_ros.evaluation.drives.track_scores import TrackScores, score_track
 from crossloc3d_ros.files import write_atomically

@@ -11,19 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from crossloc3d_ros.evaluation.poses.errors import AMONG_M, WITHIN_DEG, WITHIN_M, WRONG_M
+from crossloc3d_ros.evaluation.poses.measures import Measure, verdicts
 from crossloc3d_ros.evaluation.poses.results import interval_of, shown, wanted
-from crossloc3d_ros.evaluation.poses.scores import (
-    AMONG_M,
-    SIGMAS,
-    WITHIN_DEG,
-    WITHIN_M,
-    WRONG_M,
-    Measure,
-    PoseScores,
-    Stage,
-    expected_inside,
-    verdicts,
-)
+from crossloc3d_ros.evaluation.poses.scores import SIGMAS, PoseScores, Stage, expected_inside
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
 from crossloc3d_ros.pages.wording import percent
@@ -212,7 +203,8 @@ def _words(scores: PoseScores, words: Sequence[str]) -> str:
     paragraphs = [
         "<h3>One scan</h3><p>Each scan is localized from nothing: no pose before, no heading, no odometry. Its "
         "prediction is the pose that fits best, whether or not it is believed; a scan without a pose counts as wrong. "
-        f"The true place is among the candidates where the centre of one of the 25 lies within {AMONG_M:g} m of the robot.</p>",
+        f"The true place is among the candidates where the centre of one of the 25 lies within {AMONG_M:g} m of the "
+        "robot.</p>",
         f"<h3>Drives</h3><p>Localized is a robot at its first fix that is right to {WRONG_M:g} m; a drive on which "
         "that does not happen counts as infinitely long (∞). Errors afterwards are those of all fixes from then on, "
         "right ones and wrong ones. Then it is kidnapped: moved to another town while its wheels stand still. "
