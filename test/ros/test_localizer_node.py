@@ -512,7 +512,7 @@ def test_parameters_carry_description_and_range(active: Robot) -> None:
     names = ["scan.mounting.z_m", "top_k", "device"]
     request = DescribeParameters.Request(names=names)
     z, top_k, device = active.call(DescribeParameters, "/localizer/describe_parameters", request).descriptors
-    assert z.description == "above the ground under the robot"
+    assert z.description == "above the base frame, which stands on the ground"
     assert (z.floating_point_range[0].from_value, z.floating_point_range[0].to_value) == (-5.0, 20.0)
     assert (top_k.integer_range[0].from_value, top_k.integer_range[0].to_value) == (1, 1000)
     assert device.additional_constraints == "one of: cpu, cuda"
