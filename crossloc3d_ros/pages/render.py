@@ -53,7 +53,7 @@ def environment() -> Environment:
         "percent": wording.percent,
         "percent_range": wording.percent_range,
     }
-    result.tests["finite"] = math.isfinite
+    result.tests |= {"finite": math.isfinite, "infinite": math.isinf}
     result.globals["asset"] = _asset
     result.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return result
