@@ -110,9 +110,9 @@ def _error_chart(scores: PoseScores) -> Markup:
 
 def _belief_chart(scores: PoseScores) -> Markup:
     chart = charts.Chart(
-        charts.Axis(0.0, 1.0, "believed", [(i / 4, f"{25 * i} %") for i in range(5)]),
+        charts.Axis(0.0, 1.0, "estimated probability", [(i / 4, f"{25 * i} %") for i in range(5)]),
         charts.share_axis("right"),
-        "Believed probability against the share that was right",
+        "Estimated probability against the share that was right",
         height=330.0,
     )
     marks = [chart.line(np.array([0.0, 1.0]), np.array([0.0, 1.0]), "s-chance")]

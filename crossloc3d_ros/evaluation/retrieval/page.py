@@ -54,7 +54,7 @@ class RetrievalPage:
     """How predictions were verified; None where none were."""
     radii_m: tuple[float, ...] = RADII_M
     published_rank: int = PUBLISHED_ONE_PER_CENT
-    shown_answers: int = TOP
+    shown_places: int = TOP
 
 
 def write_page(
@@ -91,7 +91,7 @@ def describe(about: About) -> str:
 
 
 def describe_briefly(about: About) -> str:
-    """Return the same for narrow tables, in which verified answers follow those that they are made of."""
+    """Return the same for narrow tables, in which verified predictions follow those that they are made of."""
     if about.verified:
         return f"  + {about.verified} height maps"
     heading = "north" if about.heading == "aligned" else "random"
@@ -107,9 +107,9 @@ def _lines(scores: Sequence[Scores], main: Scores) -> list[Scores]:
 def _curve_chart(scores: Sequence[Scores], main: Scores, radius_m: float) -> Markup:
     ticks = [(float(n), str(n)) for n in (1, 2, 5, 10, 25, 50, 100)]
     chart = charts.Chart(
-        charts.Axis(1.0, float(CURVE), "answers looked at, N", ticks, log=True),
+        charts.Axis(1.0, float(CURVE), "retrieved places, N", ticks, log=True),
         charts.share_axis(f"AR@N within {radius_m:g} m"),
-        f"Average recall within {radius_m:g} metres over the number of answers",
+        f"Average recall within {radius_m:g} metres over the number of retrieved places",
         height=330.0,
     )
     ranks = np.arange(1.0, CURVE + 1)
