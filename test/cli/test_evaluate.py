@@ -76,7 +76,7 @@ def test_the_page_needs_nothing_but_itself(evaluated: tuple[Path, list[str]]) ->
     assert "http" not in re.sub(r'src="data:[^"]*"', "", page)
     assert "{{" not in page
     assert page.count("<figure") >= 6
-    for word in ("chance", "AR@1%", "random heading", "north-aligned"):
+    for word in ("chance level", "AR@1%", "random heading", "north-aligned"):
         assert word in page
 
 

@@ -1,6 +1,6 @@
 """The paper's figure: a query beside its first five places, seen from above, right ones framed green, wrong ones red.
 
-Which queries are shown is chosen at random with a fixed seed, half from those whose first place is right and half from
+Which queries are shown is drawn at random with a fixed seed, half from those whose first place is right and half from
 those where it is wrong: never chosen by hand.
 """
 
@@ -37,19 +37,19 @@ class Picture:
     data_uri: str
     caption: str
     right: bool | None
-    """Whether a place is right; None for the query itself."""
+    """Whether a retrieved place is right; None for the query itself."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A query and its first places."""
+    """A query and the places retrieved first."""
 
     query: Picture
-    retrieved: tuple[Picture, ...]
+    places: tuple[Picture, ...]
 
 
 def choose(right: BoolArray, count: int) -> tuple[Int64Array, Int64Array]:
-    """Return up to `count` queries at random from those with a right first place, (Q,), and as many of the others."""
+    """Return up to `count` queries at random from those that are right, (Q,), and up to `count` from the others."""
     order = np.random.default_rng(_SEED).permutation(len(right))
     return order[right[order]][:count], order[~right[order]][:count]
 

@@ -11,18 +11,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from crossloc3d_ros.evaluation.retrieval.predictions import Way
-from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, Scores
-from crossloc3d_ros.evaluation.statistics import Recall
+from crossloc3d_ros.evaluation.retrieval.scores import Scores
 
 _COLUMNS = (
     "benchmark", "weights", "setting", "heading", "query_headings", "way", "kind", "verified", "divided_by", "name",
     "queries", "areas", "measure", "rank", "radius_m", "counted", "recall", "low", "high", "chance",
 )  # fmt: skip
-
-
-def label_of(recall: Recall) -> str:
-    """Return a recall's label for people: R@25 is what was published as AR@1%."""
-    return f"{recall.label} (“AR@1%”)" if recall.rank == PUBLISHED_ONE_PER_CENT else recall.label
 
 
 def headline(scores: Sequence[Scores], query_headings: int, way: Way) -> Scores:
