@@ -64,7 +64,7 @@ class TownDrive:
 @pytest.fixture(scope="session")
 def town_drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
     """Write survey and drive: scans every 8 m, in any heading, with GNSS at 2 Hz and two doubtful fixes."""
-    from crossloc3d_ros.formats import bag
+    from crossloc3d_ros.formats import bag, messages
     from crossloc3d_ros.formats.las import write_laz
     from crossloc3d_ros.geodesy import MapFrame
 
@@ -94,7 +94,7 @@ def town_drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
         for i, place in enumerate(truth):
             fix_ns = int(stamps_ns[i]) - 200_000_000
             doubtful = i in (5, 6)
-            fix = bag.nav_sat_fix(
+            fix = messages.nav_sat_fix(
                 fix_ns, "gnss", latitude[i] + 0.01 * doubtful, longitude[i], float("nan"),
                 np.eye(3) * (40.0 if doubtful else 1.0) ** 2,
             )  # fmt: skip
@@ -103,7 +103,7 @@ def town_drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
             yaw = rng.uniform(0, 2 * np.pi)
             turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
             xyz = np.column_stack([near[:, :2] @ turn.T, near[:, 2] - 1.2])
-            cloud = bag.velodyne_cloud(int(stamps_ns[i]), "velodyne", xyz, 1.0, 0, 0.0)
+            cloud = messages.velodyne_cloud(int(stamps_ns[i]), "velodyne", xyz, 1.0, 0, 0.0)
             writer.write("/velodyne_points", bag.POINT_CLOUD, int(stamps_ns[i]), cloud)
     return TownDrive(folder / "town.laz", folder / "drive", crs, truth, stamps_ns)
 
@@ -147,7 +147,7 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
     In the first drive the receiver begins at 2 s, is lost from 40 to 46 s, doubts itself from 60 to 64 s and falls
     silent from 80 to 86 s.
     """
-    from crossloc3d_ros.formats import bag
+    from crossloc3d_ros.formats import bag, messages
     from crossloc3d_ros.formats.las import write_laz
     from crossloc3d_ros.geodesy import MapFrame
 
@@ -184,12 +184,14 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
                 drifted = 0.3 + 0.002 * t  # the odometry's frame points somewhere else and drifts
                 pose += 0.1 * speed * np.array([np.cos(drifted), np.sin(drifted), 0.0])
                 quaternion = [0.0, 0.0, np.sin(drifted / 2), np.cos(drifted / 2)]
-                writer.write("/odom", bag.ODOMETRY, stamp, bag.odometry(stamp, "odom", "base_link", pose, quaternion))
+                writer.write(
+                    "/odom", bag.ODOMETRY, stamp, messages.odometry(stamp, "odom", "base_link", pose, quaternion)
+                )
                 if tick % 5 == 2 and not (number == 0 and (80.0 < t < 86.0 or t < 2.0)):
                     latitude, longitude, _ = frame.to_geographic(place(t))
                     lost = number == 0 and 40.0 < t < 46.0
                     std = 12.0 if number == 0 and 60.0 < t < 64.0 else 0.5
-                    fix = bag.nav_sat_fix(
+                    fix = messages.nav_sat_fix(
                         stamp, "gnss", latitude[0], longitude[0], float("nan"), np.eye(3) * std**2, has_fix=not lost
                     )
                     writer.write("/gnss", bag.NAV_SAT_FIX, stamp, fix)
@@ -198,7 +200,7 @@ def recorded_area(tmp_path_factory: pytest.TempPathFactory) -> RecordedArea:
                     near = points[low:high] - place(t)
                     near = near[np.abs(near[:, 1]) < 24.0]
                     xyz = np.column_stack([near[:, :2] @ turn, near[:, 2] - 1.2])
-                    cloud = bag.velodyne_cloud(stamp, "velodyne", xyz, 1.0, 0, 0.0)
+                    cloud = messages.velodyne_cloud(stamp, "velodyne", xyz, 1.0, 0, 0.0)
                     writer.write("/points", bag.POINT_CLOUD, stamp, cloud)
         places = np.concatenate([place(float(t)) for t in times])
         truths.append(np.column_stack([places[:, :2], np.full(len(times), heading), times]))

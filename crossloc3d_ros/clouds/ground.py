@@ -393,6 +393,16 @@ def classify_ground(
     bounds = (easting.min(), northing.min(), easting.max() + cell_m, northing.max() + cell_m)
     lowest = lowest_raster(np.column_stack([easting, northing, z]), bounds, cell_m).values.astype(np.float64)
     lowest[_is_pit(lowest, cell_m)] = np.nan
+    terrain = _terrain(lowest, slope, cell_m, largest_window_m)
+    steepness = np.hypot(*np.gradient(terrain, cell_m)) if min(terrain.shape) > 1 else np.zeros_like(terrain)
+    below = Raster(terrain.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
+    steep = Raster(steepness.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
+    mask[finite] = np.abs(z - below) <= tolerance_m + 0.5 * steep * cell_m
+    return mask
+
+
+def _terrain(lowest: Float64Array, slope: float, cell_m: float, largest_window_m: float) -> Float64Array:
+    """Return the terrain under the lowest points, NaN where a cell has none."""
     holes = np.isnan(lowest)
     surface = _filled(lowest)
     trend = np.zeros_like(surface)
@@ -400,11 +410,7 @@ def classify_ground(
         objects = _objects(surface - trend, slope, cell_m, largest_window_m)
         terrain = _filled(np.where(objects | holes, np.nan, surface))
         trend = ndimage.gaussian_filter(terrain, _TREND_M / cell_m, mode="nearest")
-    steepness = np.hypot(*np.gradient(terrain, cell_m)) if min(terrain.shape) > 1 else np.zeros_like(terrain)
-    below = Raster(terrain.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
-    steep = Raster(steepness.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
-    mask[finite] = np.abs(z - below) <= tolerance_m + 0.5 * steep * cell_m
-    return mask
+    return terrain
 
 
 def _objects(surface: Float64Array, slope: float, cell_m: float, largest_window_m: float) -> BoolArray:

@@ -70,14 +70,8 @@ def prepare_scan(
     place[:, 2] = scan_heights(place, float(sensor_level[2]), reach_m=reach_m)
 
     cropped = crop_above_ground(place, half_extent_m, preprocessing)
-    counts = ScanCounts(
-        received=len(scan.points),
-        finite=finite,
-        in_range=in_range,
-        off_body=off_body,
-        above_ground=int(np.count_nonzero(place[:, 2] >= preprocessing.ground_clearance_m)),
-        in_patch=len(cropped),
-    )
+    above_ground = int(np.count_nonzero(place[:, 2] >= preprocessing.ground_clearance_m))
+    counts = ScanCounts(len(scan.points), finite, in_range, off_body, above_ground, len(cropped))
     origin = "mean" if preprocessing.scan_origin == "mean" else "given"
     patch = patch_of_cropped(cropped, half_extent_m, preprocessing, origin=origin)  # type: ignore[arg-type]
     reason = "" if patch is not None else _why_not(counts, config, preprocessing)

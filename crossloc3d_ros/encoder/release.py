@@ -21,49 +21,59 @@ _ALIASES = ("up_conv0", "up_convs", "up_blocks")
 def release_names(config: ModelConfig = CAMPUS) -> dict[str, str]:
     """Return {our key: the release's key} for every tensor of the model, aliases left out."""
     names: dict[str, str] = {}
-
-    def norm(ours: str, theirs: str) -> None:
-        names.update({f"{ours}.{part}": f"{theirs}.{part}" for part in _NORM})
-
-    def convolution(ours: str, theirs: str, position: int) -> None:
-        names[f"{ours}.weight"] = f"{theirs}.{position}.kernel"
-        norm(f"{ours}.norm", f"{theirs}.{position + 1}.bn")
-
     for i in range(len(config.voxel_sizes)):
-        convolution(f"grains.{i}.stem", f"backbone.up_conv0_lst.{i}", 0)
-        convolution(f"grains.{i}.down", f"backbone.up_convs_lst.{i}.0", 0)
-        block, ours = f"backbone.up_blocks_lst.{i}.0", f"grains.{i}.selection"
-        for branch, layers in enumerate((0, 2, 2, 3, 3)):
-            size = 1 + 2 * branch
-            for layer in range(layers):
-                convolution(f"{ours}.branches.{branch}.{layer}", f"{block}.conv{size}x{size}", 3 * layer)
-            names[f"{ours}.attentions.{branch}.conv.weight"] = f"{block}.eca{size}x{size}.conv.weight"
-            for layer in range(2):
-                convolution(f"{ours}.transforms.{branch}.{layer}", f"{block}.trans_layers.{branch}", 3 * layer)
-        convolution(f"{ours}.gate", f"{block}.trans_layer2", 0)
+        names |= _grain_names(i)
+    names |= _refinement_names(len(config.voxel_sizes) * config.sub_steps)
+    names["fusion.weight"] = "backbone.conv_fuse.0.weight"
+    names |= _norm("fusion_norm", "backbone.conv_fuse.1")
+    names["pooling.assignment"] = "pool.net_vlad.cluster_weights"
+    names["pooling.centers"] = "pool.net_vlad.cluster_weights2"
+    names["pooling.projection"] = "pool.net_vlad.hidden1_weights"
+    names["pooling.gating"] = "pool.net_vlad.context_gating.gating_weights"
+    names |= _norm("pooling.assignment_norm", "pool.net_vlad.bn1")
+    names |= _norm("pooling.output_norm", "pool.net_vlad.bn2")
+    names |= _norm("pooling.gating_norm", "pool.net_vlad.context_gating.bn1")
+    return names
+
+
+def _grain_names(i: int) -> dict[str, str]:
+    names = _convolution(f"grains.{i}.stem", f"backbone.up_conv0_lst.{i}")
+    names |= _convolution(f"grains.{i}.down", f"backbone.up_convs_lst.{i}.0")
+    block, ours = f"backbone.up_blocks_lst.{i}.0", f"grains.{i}.selection"
+    for branch, layers in enumerate((0, 2, 2, 3, 3)):
+        size = 1 + 2 * branch
+        for layer in range(layers):
+            names |= _convolution(f"{ours}.branches.{branch}.{layer}", f"{block}.conv{size}x{size}", 3 * layer)
+        names[f"{ours}.attentions.{branch}.conv.weight"] = f"{block}.eca{size}x{size}.conv.weight"
+        for layer in range(2):
+            names |= _convolution(f"{ours}.transforms.{branch}.{layer}", f"{block}.trans_layers.{branch}", 3 * layer)
+    return names | _convolution(f"{ours}.gate", f"{block}.trans_layer2")
+
+
+def _refinement_names(steps: int) -> dict[str, str]:
     transformer = "backbone.diff_transformer"
-    names["refinement.time.frequencies"] = f"{transformer}.time_mlp.0.weights"
+    names = {"refinement.time.frequencies": f"{transformer}.time_mlp.0.weights"}
     for part in ("weight", "bias"):
         names[f"refinement.time.first.{part}"] = f"{transformer}.time_mlp.1.{part}"
         names[f"refinement.time.second.{part}"] = f"{transformer}.time_mlp.3.{part}"
-    for t in range(len(config.voxel_sizes) * config.sub_steps):
+    for t in range(steps):
         ours, theirs = f"refinement.layers.{t}", f"{transformer}.attn_layers.{t}"
         names[f"{ours}.centers"] = f"{theirs}.centers"
         names[f"{ours}.query.weight"] = f"{theirs}.q_conv.weight"
         for mine, release in (("value", "v_conv"), ("transform", "trans_conv")):
             for part in ("weight", "bias"):
                 names[f"{ours}.{mine}.{part}"] = f"{theirs}.{release}.{part}"
-        norm(f"{ours}.norm", f"{theirs}.after_norm")
-    names["fusion.weight"] = "backbone.conv_fuse.0.weight"
-    norm("fusion_norm", "backbone.conv_fuse.1")
-    names["pooling.assignment"] = "pool.net_vlad.cluster_weights"
-    names["pooling.centers"] = "pool.net_vlad.cluster_weights2"
-    names["pooling.projection"] = "pool.net_vlad.hidden1_weights"
-    names["pooling.gating"] = "pool.net_vlad.context_gating.gating_weights"
-    norm("pooling.assignment_norm", "pool.net_vlad.bn1")
-    norm("pooling.output_norm", "pool.net_vlad.bn2")
-    norm("pooling.gating_norm", "pool.net_vlad.context_gating.bn1")
+        names |= _norm(f"{ours}.norm", f"{theirs}.after_norm")
     return names
+
+
+def _norm(ours: str, theirs: str) -> dict[str, str]:
+    return {f"{ours}.{part}": f"{theirs}.{part}" for part in _NORM}
+
+
+def _convolution(ours: str, theirs: str, position: int = 0) -> dict[str, str]:
+    """Return the names of a convolution at a position of a sequence, and of the batch norm behind it."""
+    return {f"{ours}.weight": f"{theirs}.{position}.kernel", **_norm(f"{ours}.norm", f"{theirs}.{position + 1}.bn")}
 
 
 def release_aliases(config: ModelConfig = CAMPUS) -> dict[str, str]:

@@ -185,9 +185,15 @@ class _Machine:
         raise ValueError("it has no end")
 
     def _step(self, name: str, argument: Any) -> None:
+        if name in _TAKE_FEW and any(isinstance(item, _Run) for item in self._stack[-3:]):
+            self._stack[-3:] = _expanded(self._stack[-3:])
+        is_known = self._push(name, argument) or self._take_few(name) or self._take_group(name)
+        if not (is_known or self._take_names(name, argument) or name in ("PROTO", "FRAME")):
+            raise self._refused(f"the instruction {name}")
+
+    def _push(self, name: str, argument: Any) -> bool:
+        """Carry out an instruction that puts a value on the stack or into the memo; return whether it is one."""
         stack = self._stack
-        if name in _TAKE_FEW and any(isinstance(item, _Run) for item in stack[-3:]):
-            stack[-3:] = _expanded(stack[-3:])
         if name in _VALUES:
             stack.append(argument)
         elif name in ("BINGET", "LONG_BINGET", "GET"):
@@ -202,7 +208,14 @@ class _Machine:
             stack.append(_EMPTY[name]())
         elif name == "MARK":
             stack.append(_Mark())
-        elif name in _TUPLES:
+        else:
+            return False
+        return True
+
+    def _take_few(self, name: str) -> bool:
+        """Carry out an instruction that takes one to three values off the stack; return whether it is one."""
+        stack = self._stack
+        if name in _TUPLES:
             items = stack[-_TUPLES[name] :]
             if len(items) < _TUPLES[name]:
                 raise ValueError("the stack is empty")
@@ -210,12 +223,21 @@ class _Machine:
         elif name == "APPEND":
             value = stack.pop()
             self._extend(stack[-1], [value])
-        elif name == "APPENDS":
-            items = self._group(expand=False)
-            self._extend(stack[-1], items)
         elif name == "SETITEM":
             value, key = stack.pop(), stack.pop()
             self._set(stack[-1], [key, value])
+        elif name == "POP":
+            stack.pop()
+        else:
+            return False
+        return True
+
+    def _take_group(self, name: str) -> bool:
+        """Carry out an instruction that takes all since the last mark; return whether it is one."""
+        stack = self._stack
+        if name == "APPENDS":
+            items = self._group(expand=False)
+            self._extend(stack[-1], items)
         elif name == "SETITEMS":
             items = self._group()
             self._set(stack[-1], items)
@@ -232,11 +254,16 @@ class _Machine:
             stack[-1].update(items)
         elif name == "FROZENSET":
             stack.append(frozenset(self._group()))
-        elif name == "POP":
-            stack.pop()
         elif name == "POP_MARK":
             self._group()
-        elif name == "GLOBAL":
+        else:
+            return False
+        return True
+
+    def _take_names(self, name: str, argument: Any) -> bool:
+        """Carry out an instruction on what a pickle names, calling nothing; return whether it is one."""
+        stack = self._stack
+        if name == "GLOBAL":
             module, _, attribute = argument.partition(" ")
             stack.append(self._name(module, attribute))
         elif name == "STACK_GLOBAL":
@@ -250,8 +277,9 @@ class _Machine:
             if not isinstance(stack[-1], (_Kind, _Array)):
                 raise self._refused(f"the state of a {type(stack[-1]).__name__}")
             stack[-1].set_state(state)
-        elif name not in ("PROTO", "FRAME"):
-            raise self._refused(f"the instruction {name}")
+        else:
+            return False
+        return True
 
     def _group(self, *, expand: bool = True) -> list[Any]:
         """Take what lies on the stack above the last mark."""

@@ -74,19 +74,10 @@ def scan_from_pointcloud2(msg: PointCloud2Like) -> Scan:
     Any field order, offset and padding, padded rows, float32 or float64 coordinates of either endianness, organised
     or not, further fields of any type. Raises CloudError that names what is wrong with the message.
     """
-    offsets, dtypes = [], []
-    for axis in "xyz":
-        offset, dtype = _coordinate(msg, axis)
-        offsets.append(offset)
-        dtypes.append(dtype)
     point_step, row_step, width, height = (int(v) for v in (msg.point_step, msg.row_step, msg.width, msg.height))
-    for axis, offset, dtype in zip("xyz", offsets, dtypes, strict=True):
-        if offset < 0:
-            raise CloudError(f"field '{axis}' begins before its point, at byte {offset}")
-        if offset + dtype.itemsize > point_step:
-            raise CloudError(f"field '{axis}' ends at byte {offset + dtype.itemsize}, the point at {point_step}")
+    offsets, dtypes = zip(*[_coordinate(msg, axis) for axis in "xyz"], strict=True)
     if width < 0 or height < 0:
-        raise CloudError(f"the cloud says that it has {height} x {width} points")
+        raise CloudError(f"the cloud's size is negative: {height} x {width} points")
     stamp_ns = int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
     if width == 0 or height == 0:
         return Scan(np.empty((0, 3), np.float32), stamp_ns, str(msg.header.frame_id))
@@ -103,7 +94,7 @@ def scan_from_pointcloud2(msg: PointCloud2Like) -> Scan:
         )
 
     points = np.empty((height, width, 3), np.float32)
-    together = dtypes[0].itemsize == 4 and offsets == [offsets[0], offsets[0] + 4, offsets[0] + 8]
+    together = dtypes[0].itemsize == 4 and offsets == (offsets[0], offsets[0] + 4, offsets[0] + 8)
     # One column of float32 triples is one strided copy instead of three.
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite and is filtered later
         if together and dtypes[0] == dtypes[1] == dtypes[2]:
@@ -154,7 +145,13 @@ def _coordinate(msg: PointCloud2Like, axis: str) -> tuple[int, np.dtype[Any]]:
         raise CloudError(f"field '{axis}' is {kind}; coordinates must be float32 or float64")
     if count > 1:
         raise CloudError(f"field '{axis}' holds {count} values a point; a coordinate is one")
-    return int(field.offset), np.dtype(POINT_FIELD_TYPES[datatype]).newbyteorder(">" if msg.is_bigendian else "<")
+    offset = int(field.offset)
+    dtype = np.dtype(POINT_FIELD_TYPES[datatype]).newbyteorder(">" if msg.is_bigendian else "<")
+    if offset < 0:
+        raise CloudError(f"field '{axis}' begins before its point, at byte {offset}")
+    if offset + dtype.itemsize > int(msg.point_step):
+        raise CloudError(f"field '{axis}' ends at byte {offset + dtype.itemsize}, the point at {msg.point_step}")
+    return offset, dtype
 
 
 def _as_bytes(data: Any) -> npt.NDArray[np.uint8]:

@@ -36,7 +36,7 @@ class Watch:
         self._stopwatch = Stopwatch()
 
     def lap(self, name: str) -> None:
-        """Note the time since the last lap as that of the step `name`, a field of `Timings`."""
+        """Record the time since the last lap as that of the step `name`, a field of `Timings`."""
         self.timings = dataclasses.replace(self.timings, **{name: 1e3 * self._stopwatch.lap()})
 
 
@@ -110,13 +110,13 @@ def posed_estimate(
     height = belief.grid[2] if math.isfinite(belief.grid[2]) else placed.grid[2]
     grid = np.array([belief.grid[0], belief.grid[1], height])
     latitude, longitude, altitude = frame.to_geographic(grid[None])
-    turn = -float(frame.convergence_rad(grid[None])[0])
+    grid_to_true_north_rad = -float(frame.convergence_rad(grid[None])[0])
     T_map_base = np.eye(4)
-    T_map_base[:3, :3] = _about_z(belief.heading_rad + turn)
+    T_map_base[:3, :3] = _about_z(belief.heading_rad + grid_to_true_north_rad)
     if gravity_base is not None:
         T_map_base[:3, :3] = T_map_base[:3, :3] @ levelling_matrix(gravity_base)[:3, :3]
     T_map_base[:3, 3] = frame.to_enu(grid[None])[0]
-    pose_covariance = _in_map(belief.covariance, turn)
+    pose_covariance = _in_map(belief.covariance, grid_to_true_north_rad)
     return dataclasses.replace(
         placed, grid=grid, enu=T_map_base[:3, 3].copy(), latitude_deg=float(latitude[0]),
         longitude_deg=float(longitude[0]), altitude_m=float(altitude[0]), covariance=pose_covariance[:3, :3],
@@ -129,11 +129,10 @@ def _about_z(angle: float) -> Float64Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _in_map(covariance: Float64Array, turn_rad: float) -> Float64Array:
+def _in_map(covariance: Float64Array, rotation_rad: float) -> Float64Array:
     """Return the covariance (6, 6) of x, y, z and the rotations about them from that of easting, northing, heading."""
-    rotation = _about_z(turn_rad)
-    turned = rotation @ covariance @ rotation.T
+    rotation = _about_z(rotation_rad)
     full = np.diag([0.0, 0.0, HEIGHT_STD_M**2, TILT_STD_RAD**2, TILT_STD_RAD**2, 0.0])
     rows = [0, 1, 5]
-    full[np.ix_(rows, rows)] = turned
+    full[np.ix_(rows, rows)] = rotation @ covariance @ rotation.T
     return full

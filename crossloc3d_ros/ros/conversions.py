@@ -25,7 +25,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from crossloc3d_ros.formats.odometry import pose_matrix
-from crossloc3d_ros.formats.pointcloud2 import pack_columns
+from crossloc3d_ros.formats.pointcloud2 import PackedCloud, pack_columns
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import Estimate, FixStatus, Float64Array, Hypotheses, Int64Array, TrackState
 
@@ -206,14 +206,18 @@ def candidate_table_message(estimate: Estimate, frame: MapFrame, global_frame_id
             "aligned_probability": pose[:, 3],
         }
     )
+    return _cloud_message(header_message(estimate.stamp_ns, global_frame_id), packed, len(candidates))
+
+
+def _cloud_message(header: Header, packed: PackedCloud, count: int) -> PointCloud2:
     return PointCloud2(
-        header=header_message(estimate.stamp_ns, global_frame_id),
+        header=header,
         height=1,
-        width=len(candidates),
+        width=count,
         fields=[PointField(name=n, offset=o, datatype=d, count=c) for n, o, d, c in packed.fields],
         is_bigendian=False,
         point_step=packed.point_step,
-        row_step=packed.point_step * len(candidates),
+        row_step=packed.point_step * count,
         data=packed.data,
         is_dense=True,
     )

@@ -210,11 +210,9 @@ class LocalizerNode(LifecycleNode):
         """Bring inputs, work and outputs together."""
         pose_on_base = None if transforms is None else transforms.pose_on_base
         session = Session(localizer, config.odometry, config.imu_time_constant_s)
-        odometry = None
-        if config.odometry == "topic":
-            odometry = OdometryInput(
-                config.base_frame_id, config.odom_frame_id, config.odometry_timeout_s, pose_on_base
-            )
+        frames = config.base_frame_id, config.odom_frame_id
+        uses_topic = config.odometry == "topic"
+        odometry = OdometryInput(*frames, config.odometry_timeout_s, pose_on_base) if uses_topic else None
         frame = localizer.aerial_map.frame
         outputs = Outputs(self, config, frame, self._status_name)
         localizing = Localizing(session, odometry, outputs, self._statistics, self.get_logger())

@@ -44,12 +44,12 @@ class _RosLogHandler(logging.Handler):
 
 
 def run_localizer(arguments: Sequence[str], load: Callable[[LocalizerNodeConfig], Localizer] = load_localizer) -> int:
-    """Run the node until it is told to stop, and return the exit code; `load` makes its localizer.
+    """Run the node until a signal stops it, and return the exit code; `load` makes its localizer.
 
     0 after SIGINT or SIGTERM, as ROS 2 launch expects it; 2 where it could not start by itself, which the log
     explains. Raises CrossLocError for arguments and parameters that are wrong.
     """
-    # The handlers are ours, so that the worker ends and the node says good-bye while the context still lives.
+    # The handlers are ours, so that the worker ends and the node is destroyed while the context is still valid.
     signal.signal(signal.SIGTERM, _interrupt)
     signal.signal(signal.SIGINT, _interrupt)
     try:
@@ -74,20 +74,25 @@ def run_localizer(arguments: Sequence[str], load: Callable[[LocalizerNodeConfig]
     except KeyboardInterrupt:
         code = 0
     finally:
-        # From here on a second signal would only tear what is being put away in order.
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        ended = node is None or node.close()
-        if handler is not None:
-            logging.getLogger("crossloc3d_ros").removeHandler(handler)
-        executor.shutdown()
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-        if not ended:
-            # A thread that hangs in compiled code makes the interpreter crash at exit; everything else is put away.
+        if not _shut_down(executor, node, handler):
+            # A thread that hangs in compiled code makes the interpreter crash at exit; everything else is shut down.
             os._exit(code)
     return code
+
+
+def _shut_down(executor: SingleThreadedExecutor, node: LocalizerNode | None, handler: logging.Handler | None) -> bool:
+    """Shut down node, executor and context; return whether the node's threads have ended."""
+    # A second signal would only interrupt the orderly shutdown.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ended = node is None or node.close()
+    if handler is not None:
+        logging.getLogger("crossloc3d_ros").removeHandler(handler)
+    executor.shutdown()
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    return ended
 
 
 def _interrupt(number: int, frame: object) -> None:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import MountingConfig, option
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.simulation.route import Route, RouteError
 from crossloc3d_ros.simulation.traffic import Traffic, TrafficConfig
@@ -169,11 +169,11 @@ class _Robot:
             movers = traffic.at(float(time), poses[i, :2, 3])
             scan = sensor.scan(self.world.scene, poses[i] @ T_base_lidar, rng, twist, movers)
             stamp = self.stamp(time)
-            cloud = bag.velodyne_cloud(stamp, "velodyne", scan.points, scan.intensity, scan.ring, scan.time)
+            cloud = messages.velodyne_cloud(stamp, "velodyne", scan.points, scan.intensity, scan.ring, scan.time)
             yield _Event(stamp, 0, "/velodyne_points", "sensor_msgs/msg/PointCloud2", cloud)
-            fix = bag.nav_sat_fix(stamp, "base_link", latitudes[i], longitudes[i], altitudes[i], np.zeros((3, 3)))
+            fix = messages.nav_sat_fix(stamp, "base_link", latitudes[i], longitudes[i], altitudes[i], np.zeros((3, 3)))
             yield _Event(stamp, 1, "/ground_truth/fix", "sensor_msgs/msg/NavSatFix", fix)
-            odometry = bag.odometry(stamp, self.truth_frame_id, "base_link", positions[i], quaternions[i],
+            odometry = messages.odometry(stamp, self.truth_frame_id, "base_link", positions[i], quaternions[i],
                                     twists[i, :3], twists[i, 3:])  # fmt: skip
             yield _Event(stamp, 2, "/ground_truth/odom", "nav_msgs/msg/Odometry", odometry)
             if progress is not None:
@@ -198,10 +198,10 @@ class _Robot:
         for i, time in enumerate(times):
             stamp = self.stamp(time)
             if lost[i]:
-                fix = bag.nav_sat_fix(stamp, "base_link", math.nan, math.nan, math.nan, has_fix=False)
+                fix = messages.nav_sat_fix(stamp, "base_link", math.nan, math.nan, math.nan, has_fix=False)
             else:
                 covariance = np.diag(sigma**2)
-                fix = bag.nav_sat_fix(stamp, "base_link", latitudes[i], longitudes[i], altitudes[i], covariance)
+                fix = messages.nav_sat_fix(stamp, "base_link", latitudes[i], longitudes[i], altitudes[i], covariance)
             yield _Event(stamp, 3, "/gnss", "sensor_msgs/msg/NavSatFix", fix)
 
     def odometry(self, rng: np.random.Generator) -> Iterator[_Event]:
@@ -219,7 +219,7 @@ class _Robot:
         covariance = np.diag([1e-4, 1e-4, 1e6, 1e6, 1e6, 1e-4])
         for i, time in enumerate(times):
             stamp = self.stamp(time)
-            message = bag.odometry(
+            message = messages.odometry(
                 stamp, "odom", "base_link", (x[i], y[i], 0.0), (0.0, 0.0, math.sin(yaw[i] / 2), math.cos(yaw[i] / 2)),
                 (speed[i], 0.0, 0.0), (0.0, 0.0, turn[i]), None, covariance,
             )  # fmt: skip
@@ -242,5 +242,5 @@ class _Robot:
         attitude = (Rotation.from_quat(quaternions) * wrong).as_quat()
         for i, time in enumerate(times):
             stamp = self.stamp(time)
-            message = bag.imu(stamp, "imu", rate[i], force[i], attitude[i])
+            message = messages.imu(stamp, "imu", rate[i], force[i], attitude[i])
             yield _Event(stamp, 5, "/imu", "sensor_msgs/msg/Imu", message)

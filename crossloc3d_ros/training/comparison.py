@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -106,21 +106,33 @@ class Result:
 
 def rows_of(table: TableName, base: TrainConfig) -> list[Row]:
     """Return the rows of a table; what a table does not vary is as in `base`."""
+    if table not in TABLES:
+        raise ConfigError(f"unknown table '{table}'; known are: {', '.join(TABLES)}")
     if table == "competitors":
         return _competitors(base)
     model = dataclasses.replace(base.model, network="crossloc3d")
     if table == "headings":
-        counts = sorted({1, 4, 8, 16, base.headings})
-        return [
-            Row(
-                f"headings_{count}",
-                "heading learned away" if count == 1 else f"{count} headings tried",
-                dataclasses.replace(base, model=model, headings=count, rotations=base.rotations if count == 1 else 1),
-                is_reference=count == base.headings,
-            )
-            for count in counts
-        ]
-    variants: list[tuple[str, str, ModelConfig]] = []
+        return _heading_rows(base, model)
+    return [
+        Row(slug, name, dataclasses.replace(base, model=changed), is_reference=changed == model)
+        for slug, name, changed in _variants(table, model)
+    ]
+
+
+def _heading_rows(base: TrainConfig, model: ModelConfig) -> list[Row]:
+    return [
+        Row(
+            f"headings_{count}",
+            "heading learned away" if count == 1 else f"{count} headings tried",
+            dataclasses.replace(base, model=model, headings=count, rotations=base.rotations if count == 1 else 1),
+            is_reference=count == base.headings,
+        )
+        for count in sorted({1, 4, 8, 16, base.headings})
+    ]
+
+
+def _variants(table: TableName, model: ModelConfig) -> Iterator[tuple[str, str, ModelConfig]]:
+    """Yield slug, name and network of each row of a table that varies the network."""
     if table == "grains":
         fine, middle, coarse = _three_grains(model)
         for sizes in (
@@ -128,39 +140,27 @@ def rows_of(table: TableName, base: TrainConfig) -> list[Row]:
         ):  # fmt: skip
             slug = "_".join(f"{1000 * size:.0f}" for size in sizes)
             name = " + ".join(f"{size:g}" for size in sizes)
-            variants.append((f"grains_{slug}", name, dataclasses.replace(model, voxel_sizes=sizes)))
+            yield f"grains_{slug}", name, dataclasses.replace(model, voxel_sizes=sizes)
     elif table == "selection":
         for kept in (0, 1, 2, 3, 4, 5):
             name = "no selection: the mean of all five" if kept == 0 else f"top {kept} of five"
-            variants.append((f"selection_{kept}", name, dataclasses.replace(model, kept_branches=kept)))
+            yield f"selection_{kept}", name, dataclasses.replace(model, kept_branches=kept)
     elif table == "refinement":
         names = {"none": "no refinement", "fine_to_coarse": "fine to coarse", "coarse_to_fine": "coarse to fine"}
-        variants = [
-            (f"refinement_{order}", name, dataclasses.replace(model, refinement=order))  # type: ignore[arg-type]
-            for order, name in names.items()
-        ]
+        for order, name in names.items():
+            yield f"refinement_{order}", name, dataclasses.replace(model, refinement=order)  # type: ignore[arg-type]
     elif table == "sub_steps":
         for steps in (1, 2, 3, 4):
-            sizes_of_steps = _memories(model, steps)
-            changed = dataclasses.replace(model, sub_steps=steps, memory_sizes=sizes_of_steps)
-            variants.append((f"sub_steps_{steps}", f"{steps} sub-step{'s' * (steps > 1)} a grain", changed))
+            changed = dataclasses.replace(model, sub_steps=steps, memory_sizes=_memories(model, steps))
+            yield f"sub_steps_{steps}", f"{steps} sub-step{'s' * (steps > 1)} a grain", changed
     elif table == "time_embedding":
-        for embedded in (False, True):
-            name = "with time embedding" if embedded else "without time embedding"
-            changed = dataclasses.replace(model, time_embedding=embedded)
-            variants.append((f"time_embedding_{'with' if embedded else 'without'}", name, changed))
+        for which, is_used in (("without", False), ("with", True)):
+            changed = dataclasses.replace(model, time_embedding=is_used)
+            yield f"time_embedding_{which}", f"{which} time embedding", changed
     elif table == "position":
         names = {"none": "no position", "radial": "distance and height", "cartesian": "x, y and height"}
-        variants = [
-            (f"position_{kind}", name, dataclasses.replace(model, position=kind))  # type: ignore[arg-type]
-            for kind, name in names.items()
-        ]
-    else:
-        raise ConfigError(f"unknown table '{table}'; known are: {', '.join(TABLES)}")
-    return [
-        Row(slug, name, dataclasses.replace(base, model=changed), is_reference=changed == model)
-        for slug, name, changed in variants
-    ]
+        for kind, name in names.items():
+            yield f"position_{kind}", name, dataclasses.replace(model, position=kind)  # type: ignore[arg-type]
 
 
 def _competitors(base: TrainConfig) -> list[Row]:

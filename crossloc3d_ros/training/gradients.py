@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
@@ -37,6 +37,30 @@ def batch_loss(model: Network, criterion: Criterion, batch: Batch, config: Train
         if torch.isfinite(loss):
             loss.backward()  # type: ignore[no-untyped-call]
         return loss.detach()
+    return _loss_in_chunks(model, clouds, chunks, lambda x: criterion(x[:pairs], x[pairs:], ignored, matches), config)
+
+
+def tensors(clouds: Sequence[Float32Array], device: str) -> list[Tensor]:
+    """Return clouds (n, 3) as tensors on a device."""
+    return [torch.from_numpy(cloud).to(device) for cloud in clouds]
+
+
+def mixed_precision(config: TrainConfig) -> AbstractContextManager[object]:
+    """Return the context in which the network computes: matrix products in bfloat16 where configured so."""
+    if config.precision == "bfloat16":
+        return torch.autocast(config.device, torch.bfloat16)
+    return nullcontext()
+
+
+def _loss_in_chunks(
+    model: Network,
+    clouds: Sequence[Sequence[Tensor]],
+    chunks: Sequence[range],
+    loss_of: Callable[[Tensor], Tensor],
+    config: TrainConfig,
+) -> Tensor:
+    """Return the loss by multistage back-propagation; `loss_of` takes the descriptors (2 P, D) of scans and submaps."""
+    pairs = len(clouds[0])
 
     def encode(rows: range) -> Tensor:
         with mixed_precision(config):
@@ -51,25 +75,13 @@ def batch_loss(model: Network, criterion: Criterion, batch: Batch, config: Train
     for rows, part in zip(chunks, parts, strict=True):
         descriptors[_both(rows, pairs)] = part
     descriptors.requires_grad_(True)
-    loss = criterion(descriptors[:pairs], descriptors[pairs:], ignored, matches)
+    loss = loss_of(descriptors)
     if torch.isfinite(loss):
         loss.backward()  # type: ignore[no-untyped-call]
         assert descriptors.grad is not None
         for rows in chunks:
             encode(rows).backward(descriptors.grad[_both(rows, pairs)])  # type: ignore[no-untyped-call]
     return loss.detach()
-
-
-def tensors(clouds: Sequence[Float32Array], device: str) -> list[Tensor]:
-    """Return clouds (n, 3) as tensors on a device."""
-    return [torch.from_numpy(cloud).to(device) for cloud in clouds]
-
-
-def mixed_precision(config: TrainConfig) -> AbstractContextManager[object]:
-    """Return the context in which the network computes: matrix products in bfloat16 where that is asked for."""
-    if config.precision == "bfloat16":
-        return torch.autocast(config.device, torch.bfloat16)
-    return nullcontext()
 
 
 def _chunks(pairs: int, size: int) -> list[range]:

@@ -30,10 +30,8 @@ from crossloc3d_ros.datasets.recordings import RecordedScans, Topics, find_topic
 from crossloc3d_ros.errors import DatasetError
 from crossloc3d_ros.files import atomic_path, size_of, work_lock, write_atomically, write_error
 from crossloc3d_ros.formats.bag import open_bag
-from crossloc3d_ros.formats.cs_campus3d import (
-    PRESETS,
-    CloudTable,
-    QueryTable,
+from crossloc3d_ros.formats.cs_campus3d import PRESETS, CloudTable, QueryTable
+from crossloc3d_ros.formats.cs_campus3d_writer import (
     write_cloud,
     write_database,
     write_info,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,7 @@ def model_card(
     benchmarks: list[dict[str, Any]] = []
     if weights is not None or results:
         checkpoint = load_checkpoint(shown)
-        if "examined" in checkpoint.metadata:
-            examined = json.loads(checkpoint.metadata["examined"])
-            validations = [v for v in validations if v["step"] < examined["step"]] + [examined]
+        validations = _until_exported(validations, checkpoint.metadata)
         benchmarks = _read_results(results, checkpoint.fingerprint)
     if not validations or not starts:
         raise TrainingError(f"the run in {folder} has not validated yet: there are no results to write a card from")
@@ -70,6 +68,14 @@ def model_card(
         _limits(material),
     ]
     return "\n".join(sections)
+
+
+def _until_exported(validations: list[dict[str, Any]], metadata: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the validations up to the one of the exported weights, which their file holds whole."""
+    if "examined" not in metadata:
+        return validations
+    exported = json.loads(metadata["examined"])
+    return [v for v in validations if v["step"] < exported["step"]] + [exported]
 
 
 def _introduction(config: TrainConfig, material: Material, history: Sequence[dict[str, Any]]) -> str:

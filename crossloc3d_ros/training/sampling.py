@@ -70,6 +70,10 @@ class Sampler(Protocol):
         ...
 
 
+_Pair = tuple[Float32Array, Float32Array, Float64Array, Float64Array]
+"""Scan, submap, place and the submap's centre."""
+
+
 class _Wish(NamedTuple):
     """A place that a pair is wanted of."""
 
@@ -172,16 +176,13 @@ class BatchSampler:
             wanted += [_Wish(int(hard.town[r]), int(hard.scan[r]), heading) for r in (row, *others)]
         return wanted[:count]
 
-    def _pair(
-        self, town_index: int, rng: np.random.Generator, taken: Float64Array, wish: _Wish | None
-    ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array]:
+    def _pair(self, town_index: int, rng: np.random.Generator, taken: Float64Array, wish: _Wish | None) -> _Pair:
         """Return a scan, a submap that it lies in, the scan's place and the submap's centre.
 
         The place is the one wished for, or one not yet among those `taken`, and then with probability `near_share`
         near one of them.
         """
         town, field, config = self._towns[town_index], self._fields[town_index], self._config
-        preprocessing = config.preprocessing
         wish_near = len(taken) > 0 and rng.random() < config.near_share
         for attempt in range(_ATTEMPTS):
             wished = wish is not None and attempt == 0
@@ -196,34 +197,40 @@ class BatchSampler:
                 continue
             if config.augmentation == "paper":
                 pair = self._paper_pair(town, field, index, rng)
-                if pair is not None:
-                    return pair
-                continue
-            seen = occlude(town.scan_points(index), rng, config)
-            scan = make_patch(seen, preprocessing.scan_half_extent_m, preprocessing)
-            centre = self._centre(place, rng)
-            heading = wish.heading_rad if wish is not None else float(rng.uniform(0.0, 2.0 * math.pi))
-            submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
-            submap_points = change(submap_points, preprocessing.half_extent_m, rng, config)
-            mirrored = bool(rng.integers(2))
-            if mirrored:
-                submap_points[:, 1] *= -1.0
-            submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
-            if scan is None or submap is None:
-                continue
-            angle = float(town.scan_heading_rad[index]) - heading + heading_error(rng, config)
-            scan_points = turn(scan.points, angle)
-            if mirrored:
-                scan_points[:, 1] *= -1.0
-            return scan_points, submap.points, place, centre
+            else:
+                pair = self._augmented_pair(town, field, index, None if wish is None else wish.heading_rad, rng)
+            if pair is not None:
+                return pair
         raise TrainingError(
             f"{town.name}: {_ATTEMPTS} scans in a row gave no pair of patches with at least "
-            f"{preprocessing.min_points} points; lower min_points or make other places"
+            f"{config.preprocessing.min_points} points; lower min_points or make other places"
         )
 
-    def _paper_pair(
-        self, town: TrainingTown, field: PointField, index: int, rng: np.random.Generator
-    ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array] | None:
+    def _augmented_pair(
+        self, town: TrainingTown, field: PointField, index: int, heading_rad: float | None, rng: np.random.Generator
+    ) -> _Pair | None:
+        """Return what `_pair` does, by this package's recipe: the submap along `heading_rad`, or any heading."""
+        config, preprocessing = self._config, self._config.preprocessing
+        place = town.scan_xy_m[index]
+        seen = occlude(town.scan_points(index), rng, config)
+        scan = make_patch(seen, preprocessing.scan_half_extent_m, preprocessing)
+        centre = self._centre(place, rng)
+        heading = float(rng.uniform(0.0, 2.0 * math.pi)) if heading_rad is None else heading_rad
+        submap_points = field.cut(centre, heading, preprocessing.half_extent_m)
+        submap_points = change(submap_points, preprocessing.half_extent_m, rng, config)
+        mirrored = bool(rng.integers(2))
+        if mirrored:
+            submap_points[:, 1] *= -1.0
+        submap = make_patch(submap_points, preprocessing.half_extent_m, preprocessing)
+        if scan is None or submap is None:
+            return None
+        angle = float(town.scan_heading_rad[index]) - heading + heading_error(rng, config)
+        scan_points = turn(scan.points, angle)
+        if mirrored:
+            scan_points[:, 1] *= -1.0
+        return scan_points, submap.points, place, centre
+
+    def _paper_pair(self, town: TrainingTown, field: PointField, index: int, rng: np.random.Generator) -> _Pair | None:
         """Return what `_pair` does, by the published recipe: the scan along the robot, the submap to the north."""
         preprocessing = self._config.preprocessing
         place = town.scan_xy_m[index]

@@ -6,7 +6,6 @@ there: all that is needed is the survey of which the map is made.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.formats.las import expand_inputs
 from crossloc3d_ros.simulation.real_world import LocalSurvey, read_survey, world_from_points
 from crossloc3d_ros.simulation.world import World
+from crossloc3d_ros.stopwatch import Stopwatch
 from crossloc3d_ros.training.places import SURFACE_CLEARANCE_M, Made, above_terrain, already_made, training_town
 from crossloc3d_ros.training.shards import TRAINING, Manifest, TownEntry, write_manifest, write_town
 from crossloc3d_ros.types import Float64Array, Int64Array
@@ -46,12 +46,9 @@ def make_survey_places(
     """
     files = expand_inputs(surveys)
     settings = {
-        "seed": seed,
-        "scans": scans,
-        "surveys": {file.name: sha256(file) for file in files},
-        "places": to_dict(config),
+        "seed": seed, "scans": scans, "surveys": {file.name: sha256(file) for file in files}, "places": to_dict(config),
         "preprocessing": to_dict(preprocessing),
-    }
+    }  # fmt: skip
     made = already_made(output, settings)
     if made:
         return Manifest(settings, tuple(made.values()))
@@ -66,13 +63,13 @@ def make_survey_places(
     parts = [rows for rows in _parts(poses[:, :2, 3], survey) if len(rows) >= _LEAST_SCANS]
     if not parts:
         raise AerialDataError(f"{survey.name}: {scans} scans are too few for its area; ask for more")
+    stopwatch = Stopwatch()
     for number, rows in enumerate(parts):
-        started = time.perf_counter()
         file = f"{TRAINING}_{seed}_{number:04d}_{FAMILY}.npz"
         near = _near(above_ground, poses[rows, :2, 3], 1.5 * preprocessing.half_extent_m)
         town = training_town(file, poses[rows], [world] * len(rows), near, config, preprocessing, rng)
         write_town(output / file, town)
-        seconds = round(time.perf_counter() - started, 2)
+        seconds = round(stopwatch.lap(), 2)
         made[file] = TownEntry(file, TRAINING, FAMILY, seed, len(town), 0, seconds)
         report(Made(len(made), len(parts), made[file], seconds * (len(parts) - number - 1)))
     # The manifest last: a folder without one is begun anew.

@@ -24,7 +24,8 @@ from crossloc3d_ros.datasets.pose_drives import DrivePlan
 from crossloc3d_ros.datasets.pose_sets import SimulatedPoses
 from crossloc3d_ros.datasets.simulated import BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.evaluation.retrieval.predictions import load_predictions, save_predictions
-from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS, write_cloud
+from crossloc3d_ros.formats.cs_campus3d import CLOUD_POINTS, PRESETS
+from crossloc3d_ros.formats.cs_campus3d_writer import write_cloud
 from crossloc3d_ros.simulation.survey import SurveyConfig
 
 TINY = SimulatedBenchmark(

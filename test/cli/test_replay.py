@@ -22,7 +22,7 @@ from crossloc3d_ros.cli import replay
 from crossloc3d_ros.config import BuildConfig, LocalizerNodeConfig, ModelConfig, PreprocessingConfig, from_dict
 from crossloc3d_ros.config.sources import read_node_config
 from crossloc3d_ros.errors import BagError, ConfigError
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.replay import sources
 
 SMALL_MODEL = ModelConfig(
@@ -201,7 +201,7 @@ def test_old_results_do_not_outlive_a_failed_run(installed: Installation, tmp_pa
     (tmp_path / "notes.txt").write_text("mine")
     with bag.BagWriter(tmp_path / "empty") as writer:
         writer.add_topic("/points", bag.POINT_CLOUD)
-        writer.write("/gnss", bag.NAV_SAT_FIX, 1, bag.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
+        writer.write("/gnss", bag.NAV_SAT_FIX, 1, messages.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
     victim = Installation(installed.weights, installed.map, tmp_path / "empty")
     assert replay.main(victim.arguments(tmp_path)) == 2
     assert not (tmp_path / "index.html").exists()
@@ -246,7 +246,7 @@ def test_the_odometry_is_found_or_named(tmp_path: Path) -> None:
             writer.add_topic("/points", bag.POINT_CLOUD)
             for name in names:
                 writer.add_topic(name, bag.ODOMETRY)
-            writer.write("/gnss", bag.NAV_SAT_FIX, 1, bag.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
+            writer.write("/gnss", bag.NAV_SAT_FIX, 1, messages.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
         with bag.open_bag(path) as reader:
             config = from_dict(LocalizerNodeConfig, settings)
             source = sources.choose_odometry(reader, topic, config, asked_for=asked_for)

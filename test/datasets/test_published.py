@@ -13,7 +13,8 @@ import pytest
 from crossloc3d_ros.config import PreprocessingConfig
 from crossloc3d_ros.datasets.published import load_evaluation_set, open_source
 from crossloc3d_ros.errors import DatasetError
-from crossloc3d_ros.formats.cs_campus3d import PRESETS, write_cloud, write_info
+from crossloc3d_ros.formats.cs_campus3d import PRESETS
+from crossloc3d_ros.formats.cs_campus3d_writer import write_cloud, write_info
 
 OURS = PreprocessingConfig(min_points=32)
 RELEASE = PreprocessingConfig(

@@ -29,6 +29,7 @@ from crossloc3d_ros.datasets.recordings import (
 )
 from crossloc3d_ros.errors import BagError
 from crossloc3d_ros.formats import bag as bags
+from crossloc3d_ros.formats import messages
 from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.geodesy import MapFrame
 
@@ -143,11 +144,11 @@ def recorded(tmp_path: Path) -> Callable[..., Path]:
         with bags.BagWriter(path) as writer:
             for topic in topics:
                 if "gnss" in topic:
-                    writer.write(topic, bags.NAV_SAT_FIX, 5, bags.nav_sat_fix(5, "gnss", 52.0, 5.0, 0.0))
+                    writer.write(topic, bags.NAV_SAT_FIX, 5, messages.nav_sat_fix(5, "gnss", 52.0, 5.0, 0.0))
                 elif "imu" in topic:
-                    writer.write(topic, bags.IMU, 5, bags.imu(5, "imu", (0, 0, 0), (0, 0, 9.8)))
+                    writer.write(topic, bags.IMU, 5, messages.imu(5, "imu", (0, 0, 0), (0, 0, 9.8)))
                 else:
-                    cloud = bags.velodyne_cloud(5, "velodyne", np.zeros((10, 3)), 0, 0, 0)
+                    cloud = messages.velodyne_cloud(5, "velodyne", np.zeros((10, 3)), 0, 0, 0)
                     writer.write(topic, bags.POINT_CLOUD, 5, cloud)
         return path
 

@@ -9,7 +9,7 @@ import pytest
 
 from crossloc3d_ros.datasets.truth import TruthTrack, find_heading_topic, find_truth_topic, read_heading, read_truth
 from crossloc3d_ros.errors import BagError
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.geodesy import MapFrame
 
 FRAME = MapFrame("EPSG:32631", np.array([628_700.0, 5_803_600.0, 2.0]), 43.0)
@@ -51,7 +51,7 @@ def fix_at(seconds: float, easting: float, std_m: float | None = 1.0, **options:
     latitude, longitude, altitude = FRAME.to_geographic(np.array([[easting, 5_803_600.0, 3.0]]))
     covariance = None if std_m is None else np.eye(3) * std_m**2
     stamp_ns = START + round(seconds * SECOND)
-    return bag.nav_sat_fix(
+    return messages.nav_sat_fix(
         stamp_ns, "gnss", float(latitude[0]), float(longitude[0]), float(altitude[0]), covariance, **options
     )
 
@@ -85,7 +85,9 @@ def test_fixes_out_of_order_and_repeated_are_put_in_order(tmp_path: Path) -> Non
 def test_which_topic_is_the_truth(tmp_path: Path) -> None:
     def bag_with(name: str, *topics: str) -> Path:
         with bag.BagWriter(tmp_path / name) as writer:
-            writer.write("/odom", bag.ODOMETRY, START, bag.odometry(START, "odom", "base", [0, 0, 0], [0, 0, 0, 1]))
+            writer.write(
+                "/odom", bag.ODOMETRY, START, messages.odometry(START, "odom", "base", [0, 0, 0], [0, 0, 0, 1])
+            )
             for topic in topics:
                 writer.write(topic, bag.NAV_SAT_FIX, START, fix_at(0, 628_700.0))
         return tmp_path / name
@@ -140,13 +142,13 @@ def write_truth(path: Path, headings: list[float], turned_rad: float = 0.0) -> P
         for i, heading in enumerate(headings):
             stamp = START + i * SECOND
             latitude, longitude, _ = FRAME.to_geographic(place[None])
-            fix = bag.nav_sat_fix(stamp, "gnss", float(latitude[0]), float(longitude[0]), float("nan"), np.eye(3))
+            fix = messages.nav_sat_fix(stamp, "gnss", float(latitude[0]), float(longitude[0]), float("nan"), np.eye(3))
             writer.write("/ground_truth/fix", bag.NAV_SAT_FIX, stamp, fix)
             x, y, _ = FRAME.to_enu(place[None])[0]
             turn = np.exp(1j * turned_rad)
             told = turn * complex(x, y)
             yaw = heading + turned_rad
-            message = bag.odometry(
+            message = messages.odometry(
                 stamp, "world", "base_link", (told.real, told.imag, 0.0), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
             )
             writer.write("/ground_truth/odom", bag.ODOMETRY, stamp, message)
@@ -185,7 +187,7 @@ def test_an_orientation_that_was_never_filled_in_is_no_heading(tmp_path: Path) -
     with bag.BagWriter(tmp_path / "drive") as writer:
         for i, quaternion in enumerate([(0, 0, 0, 0), (0, 0, 0, float("nan")), (0, 0, 1, 0)]):
             stamp = START + i
-            message = bag.odometry(stamp, "world", "base_link", (0, 0, 0), quaternion)
+            message = messages.odometry(stamp, "world", "base_link", (0, 0, 0), quaternion)
             writer.write("/ground_truth/odom", bag.ODOMETRY, stamp, message)
     with bag.open_bag(tmp_path / "drive") as reader:
         headings = read_heading(reader, "/ground_truth/odom", track([], []), FRAME)

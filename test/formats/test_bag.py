@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from crossloc3d_ros.errors import BagError
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 100_000_000
@@ -34,9 +34,9 @@ def write_bag(path: Path, storage: bag.Storage = "mcap", scans: int = 6, points:
         writer.add_topic("/velodyne_points", bag.POINT_CLOUD, bag.OfferedQos("best_effort", "volatile", 5))
         for i in range(scans):
             stamp_ns = START_NS + i * STEP_NS
-            cloud = bag.velodyne_cloud(stamp_ns, "velodyne", **cloud_columns(i, points))
+            cloud = messages.velodyne_cloud(stamp_ns, "velodyne", **cloud_columns(i, points))
             writer.write("/velodyne_points", bag.POINT_CLOUD, stamp_ns, cloud)
-            fix = bag.nav_sat_fix(stamp_ns, "gnss", 52.0 + i, 4.0, 43.0, np.diag([1.0, 2.0, 3.0]))
+            fix = messages.nav_sat_fix(stamp_ns, "gnss", 52.0 + i, 4.0, 43.0, np.diag([1.0, 2.0, 3.0]))
             writer.write("/gnss", bag.NAV_SAT_FIX, stamp_ns, fix)
     return path
 
@@ -49,7 +49,7 @@ def write_ros1_bag(path: Path, scans: int = 3) -> Path:
         latched = writer.add_connection("/gnss", bag.NAV_SAT_FIX, typestore=store, latching=1)
         for i in range(scans):
             stamp_ns = START_NS + i * STEP_NS
-            new = bag.velodyne_cloud(stamp_ns, "velodyne", **cloud_columns(i))
+            new = messages.velodyne_cloud(stamp_ns, "velodyne", **cloud_columns(i))
             head = cls["std_msgs/msg/Header"](
                 seq=i,
                 stamp=cls["builtin_interfaces/msg/Time"](new.header.stamp.sec, new.header.stamp.nanosec),
@@ -68,7 +68,7 @@ def write_ros1_bag(path: Path, scans: int = 3) -> Path:
 
 def assert_is_cloud(message: object, seed: int) -> None:
     columns = cloud_columns(seed)
-    table = np.frombuffer(bytes(message.data), dtype=bag.VELODYNE_POINT)
+    table = np.frombuffer(bytes(message.data), dtype=messages.VELODYNE_POINT)
     np.testing.assert_array_equal(np.column_stack([table["x"], table["y"], table["z"]]), columns["points"])
     np.testing.assert_array_equal(table["intensity"], columns["intensity"])
     np.testing.assert_array_equal(table["ring"], columns["ring"])
@@ -180,7 +180,7 @@ def test_a_missing_topic_lists_the_topics_there_are(tmp_path: Path) -> None:
 def test_several_topics_of_a_type_are_not_guessed_between(tmp_path: Path) -> None:
     with bag.BagWriter(tmp_path / "two") as writer:
         for topic in ("/front", "/rear"):
-            writer.write(topic, bag.POINT_CLOUD, 1, bag.velodyne_cloud(1, "lidar", **cloud_columns(0)))
+            writer.write(topic, bag.POINT_CLOUD, 1, messages.velodyne_cloud(1, "lidar", **cloud_columns(0)))
     with (
         bag.open_bag(tmp_path / "two") as reader,
         pytest.raises(BagError, match=r"/front, /rear\); choose with --topic"),
@@ -262,7 +262,7 @@ def test_unfinished_missing_and_foreign_paths_say_what_to_do(tmp_path: Path) -> 
 
 def test_an_interrupted_writer_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), bag.BagWriter(tmp_path / "drive") as writer:
-        writer.write("/gnss", bag.NAV_SAT_FIX, 1, bag.nav_sat_fix(1, "gnss", 52.0, 4.0, 43.0))
+        writer.write("/gnss", bag.NAV_SAT_FIX, 1, messages.nav_sat_fix(1, "gnss", 52.0, 4.0, 43.0))
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
 
@@ -277,10 +277,12 @@ def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
 def test_odometry_imu_and_pose_keep_their_numbers(tmp_path: Path) -> None:
     covariance = np.arange(36.0).reshape(6, 6)
     with bag.BagWriter(tmp_path / "drive") as writer:
-        odometry = bag.odometry(7, "odom", "base_link", [1, 2, 3], [0, 0, 0.6, 0.8], [4, 0, 0], [0, 0, 0.5], covariance)
+        odometry = messages.odometry(
+            7, "odom", "base_link", [1, 2, 3], [0, 0, 0.6, 0.8], [4, 0, 0], [0, 0, 0.5], covariance
+        )
         writer.write("/odom", bag.ODOMETRY, 7, odometry)
-        writer.write("/imu", bag.IMU, 8, bag.imu(8, "imu", [0.1, 0.2, 0.3], [0, 0, 9.81]))
-        writer.write("/pose", bag.POSE_STAMPED, 9, bag.pose_stamped(9, "map", [1, 2, 3], [0, 0, 0, 1]))
+        writer.write("/imu", bag.IMU, 8, messages.imu(8, "imu", [0.1, 0.2, 0.3], [0, 0, 9.81]))
+        writer.write("/pose", bag.POSE_STAMPED, 9, messages.pose_stamped(9, "map", [1, 2, 3], [0, 0, 0, 1]))
     with bag.open_bag(tmp_path / "drive") as reader:
         odom, imu, pose = (m.message for m in reader.messages())
     assert (odom.pose.pose.position.x, odom.pose.pose.orientation.w, odom.twist.twist.linear.x) == (1.0, 0.8, 4.0)
@@ -295,9 +297,9 @@ FILL_THE_DISK = """
 import resource, sys
 import numpy as np
 from crossloc3d_ros.errors import BagError
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
-cloud = bag.velodyne_cloud(1, "velodyne", np.zeros((20_000, 3)), 1.0, 3, 0.0)
+cloud = messages.velodyne_cloud(1, "velodyne", np.zeros((20_000, 3)), 1.0, 3, 0.0)
 try:
     with bag.BagWriter(sys.argv[1], sys.argv[2]) as writer:
         for i in range(20):

@@ -22,6 +22,8 @@ from crossloc3d_ros.formats.cs_campus3d import (
     read_evaluation,
     read_info,
     read_training,
+)
+from crossloc3d_ros.formats.cs_campus3d_writer import (
     write_cloud,
     write_database,
     write_info,

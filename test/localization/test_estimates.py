@@ -1,4 +1,4 @@
-"""What is told: the same pose in every frame, no number where nothing is known, no fix on less than a pose."""
+"""Estimates: the same pose in every frame, no number where nothing is known, no fix on less than a pose."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_the_covariance_turns_with_the_frame() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0, -1.3])
-def test_the_base_leans_as_gravity_says(heading: float) -> None:
+def test_the_base_leans_as_measured_by_gravity(heading: float) -> None:
     true = Rotation.from_euler("ZYX", [heading, 0.08, -0.05]).as_matrix()
     gravity = true.T @ np.array([0.0, 0.0, 9.81])
     found = posed(belief([*ORIGIN], heading), gravity)
@@ -133,7 +133,7 @@ def test_a_place_alone_has_a_state_but_no_heading() -> None:
         assert len(found.aligned) == len(found.hypotheses) == 0
 
 
-def test_no_estimate_tells_no_number() -> None:
+def test_no_estimate_holds_no_number() -> None:
     found = no_estimate(5, "the scan is empty", ScanCounts(received=0))
     numbers = [
         *found.grid,
@@ -148,7 +148,7 @@ def test_no_estimate_tells_no_number() -> None:
     assert len(found.candidates) == len(found.aligned) == len(found.hypotheses) == 0
 
 
-def test_the_watch_notes_each_lap_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watch_records_each_lap_once(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([1.0, 1.5, 1.75])
     monkeypatch.setattr("crossloc3d_ros.stopwatch.time.perf_counter", lambda: next(times))
     watch = Watch()

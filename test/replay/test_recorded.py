@@ -14,7 +14,7 @@ from crossloc3d_ros.errors import BagError
 from crossloc3d_ros.evaluation.drives import evaluation as drive_evaluation
 from crossloc3d_ros.evaluation.drives.estimates import read_estimates
 from crossloc3d_ros.evaluation.drives.page import About, write_report
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.replay import recorded as replay
 
@@ -102,15 +102,15 @@ def test_a_bag_without_gnss_is_localized_and_not_scored(
 
 def clouds_that_are_none() -> Iterator[tuple[str, object]]:
     points = np.zeros((12, 3), np.float32)
-    yield "empty", bag.velodyne_cloud(1, "velodyne", np.empty((0, 3)), 1.0, 0, 0.0)
-    yield "twelve points", bag.velodyne_cloud(2, "velodyne", points, 1.0, 0, 0.0)
-    yield "all NaN", bag.velodyne_cloud(3, "velodyne", np.full((5000, 3), np.nan), 1.0, 0, 0.0)
-    yield "far away", bag.velodyne_cloud(4, "velodyne", np.full((5000, 3), 1e30), 1.0, 0, 0.0)
+    yield "empty", messages.velodyne_cloud(1, "velodyne", np.empty((0, 3)), 1.0, 0, 0.0)
+    yield "twelve points", messages.velodyne_cloud(2, "velodyne", points, 1.0, 0, 0.0)
+    yield "all NaN", messages.velodyne_cloud(3, "velodyne", np.full((5000, 3), np.nan), 1.0, 0, 0.0)
+    yield "far away", messages.velodyne_cloud(4, "velodyne", np.full((5000, 3), 1e30), 1.0, 0, 0.0)
     wrong = np.zeros(12, dtype=[("x", "<u4"), ("y", "<u4"), ("z", "<u4")])
-    yield "wrong type", bag.structured_cloud(5, "velodyne", wrong)
+    yield "wrong type", messages.structured_cloud(5, "velodyne", wrong)
     flat = np.zeros(12, dtype=[("x", "<f4"), ("y", "<f4")])
-    yield "no z", bag.structured_cloud(6, "velodyne", flat)
-    short = bag.velodyne_cloud(7, "velodyne", points, 1.0, 0, 0.0)
+    yield "no z", messages.structured_cloud(6, "velodyne", flat)
+    short = messages.velodyne_cloud(7, "velodyne", points, 1.0, 0, 0.0)
     short.data = short.data[:100]
     yield "too short", short
 
@@ -135,7 +135,7 @@ def test_hopeless_clouds_become_rows_without_a_fix_that_say_why(
 
 def test_scans_without_a_stamp_take_the_time_of_recording(localizer: Localizer, tmp_path: Path) -> None:
     with bag.BagWriter(tmp_path / "drive") as writer:
-        cloud = bag.velodyne_cloud(0, "velodyne", np.zeros((12, 3)), 1.0, 0, 0.0)
+        cloud = messages.velodyne_cloud(0, "velodyne", np.zeros((12, 3)), 1.0, 0, 0.0)
         writer.write("/points", bag.POINT_CLOUD, 1_234_567_890_123_456_789, cloud)
     with bag.open_bag(tmp_path / "drive") as reader:
         replay.localize_bag(reader, "/points", localizer, tmp_path / "e.csv")
@@ -147,7 +147,7 @@ def test_a_topic_that_is_missing_or_empty_is_said(town_drive, localizer: Localiz
         replay.localize_bag(reader, "/points", localizer, tmp_path / "e.csv")
     with bag.BagWriter(tmp_path / "drive") as writer:
         writer.add_topic("/points", bag.POINT_CLOUD)
-        writer.write("/gnss", bag.NAV_SAT_FIX, 1, bag.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
+        writer.write("/gnss", bag.NAV_SAT_FIX, 1, messages.nav_sat_fix(1, "gnss", 52.0, 4.0, 0.0))
     with bag.open_bag(tmp_path / "drive") as reader, pytest.raises(BagError, match="holds no message"):
         replay.localize_bag(reader, "/points", localizer, tmp_path / "e.csv")
 
@@ -159,12 +159,12 @@ def test_an_imu_levels_the_scans(town_drive, localizer: Localizer, tmp_path: Pat
     mount = np.array([0.0, 0.0, 1.2])
     with bag.open_bag(town_drive.bag) as reader, bag.BagWriter(tmp_path / "leaning") as writer:
         for _, t_ns, cloud in list(reader.messages(["/velodyne_points"]))[:6]:
-            table = np.frombuffer(bytes(cloud.data), dtype=bag.VELODYNE_POINT)
+            table = np.frombuffer(bytes(cloud.data), dtype=messages.VELODYNE_POINT)
             xyz = (np.column_stack([table["x"], table["y"], table["z"]]) + mount) @ turn - mount
             force = turn.T @ [0.0, 0.0, 9.81]
-            writer.write("/imu", bag.IMU, t_ns - 1, bag.imu(t_ns - 1, "imu", [0, 0, 0], force))
+            writer.write("/imu", bag.IMU, t_ns - 1, messages.imu(t_ns - 1, "imu", [0, 0, 0], force))
             writer.write(
-                "/velodyne_points", bag.POINT_CLOUD, t_ns, bag.velodyne_cloud(t_ns, "velodyne", xyz, 1.0, 0, 0.0)
+                "/velodyne_points", bag.POINT_CLOUD, t_ns, messages.velodyne_cloud(t_ns, "velodyne", xyz, 1.0, 0, 0.0)
             )
     found = {}
     for imu_topic in (None, "/imu"):

@@ -17,7 +17,7 @@ from crossloc3d_ros.errors import BagError
 from crossloc3d_ros.evaluation.drives.estimates import read_estimates
 from crossloc3d_ros.evaluation.drives.evaluation import ESTIMATES, SUMMARY, evaluate, write_summary
 from crossloc3d_ros.evaluation.drives.page import About, write_report
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.localizer import no_estimate
@@ -74,17 +74,17 @@ def room(x_m: float, heading_rad: float) -> np.ndarray:
 
 def cloud(stamp_ns: int, x_m: float = 0.0, heading_rad: float = 0.0, small: bool = True) -> Any:
     points = room(x_m, heading_rad)
-    return bag.velodyne_cloud(stamp_ns, "velodyne", points[::40] if small else points, 1.0, 0, 0.0)
+    return messages.velodyne_cloud(stamp_ns, "velodyne", points[::40] if small else points, 1.0, 0, 0.0)
 
 
 def odometry(stamp_ns: int, x_m: float, y_m: float = 0.0, heading_rad: float = 0.0, child: str = "base_link") -> Any:
     half = heading_rad / 2
-    return bag.odometry(stamp_ns, "odom", child, (x_m, y_m, 0.0), (0, 0, np.sin(half), np.cos(half)))
+    return messages.odometry(stamp_ns, "odom", child, (x_m, y_m, 0.0), (0, 0, np.sin(half), np.cos(half)))
 
 
-def record(path: Path, messages: list[tuple[str, str, int, Any]]) -> Path:
+def record(path: Path, recorded: list[tuple[str, str, int, Any]]) -> Path:
     with bag.BagWriter(path) as writer:
-        for topic, kind, recorded_ns, message in sorted(messages, key=lambda m: m[2]):
+        for topic, kind, recorded_ns, message in sorted(recorded, key=lambda m: m[2]):
             writer.write(topic, kind, recorded_ns, message)
     return path
 
@@ -99,17 +99,17 @@ def replayed(path: Path, odometry_topic: str | None = "/odom", **options: Any) -
 
 def drive(path: Path, *, scans: int = 6, late_ns: int = 0) -> Path:
     """Record a drive along an arc at 2 m/s: odometry at 20 Hz, a scan each half second, between two samples."""
-    messages: list[tuple[str, str, int, Any]] = []
+    recorded: list[tuple[str, str, int, Any]] = []
     for tick in range(20 * scans // 2 + 5):
         t = tick / 20
         stamp = START + round(t * SECOND)
         turn = 0.2 * t
         message = odometry(stamp, 10 * np.sin(turn), 10 * (1 - np.cos(turn)), turn)
-        messages.append(("/odom", bag.ODOMETRY, stamp + late_ns, message))
+        recorded.append(("/odom", bag.ODOMETRY, stamp + late_ns, message))
     for i in range(scans):
         stamp = START + i * SECOND // 2 + 20_000_000
-        messages.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
-    return record(path, messages)
+        recorded.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
+    return record(path, recorded)
 
 
 @pytest.mark.parametrize("late_ns", [0, 120_000_000])
@@ -143,10 +143,10 @@ def test_without_odometry_nothing_is_told(tmp_path: Path) -> None:
 def test_a_cloud_that_cannot_be_used_is_bridged(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive")
     with bag.open_bag(path) as reader:
-        messages = [(t, bag.ODOMETRY if t == "/odom" else bag.POINT_CLOUD, ns, m) for t, ns, m in reader.messages()]
-    third = [m for m in messages if m[0] == "/points"][2][3]
+        recorded = [(t, bag.ODOMETRY if t == "/odom" else bag.POINT_CLOUD, ns, m) for t, ns, m in reader.messages()]
+    third = [m for m in recorded if m[0] == "/points"][2][3]
     third.data = third.data[:50]
-    listener = replayed(record(tmp_path / "broken", messages))
+    listener = replayed(record(tmp_path / "broken", recorded))
     table = read_estimates(tmp_path / "e.csv")
     assert len(table) == 6
     assert len(listener.motions) == 5
@@ -156,12 +156,12 @@ def test_a_cloud_that_cannot_be_used_is_bridged(tmp_path: Path) -> None:
 
 
 def test_odometry_that_stops_holds_no_scan_for_ever(tmp_path: Path) -> None:
-    messages = [("/odom", bag.ODOMETRY, START + i * 50_000_000, odometry(START + i * 50_000_000, 0.1 * i))
+    recorded = [("/odom", bag.ODOMETRY, START + i * 50_000_000, odometry(START + i * 50_000_000, 0.1 * i))
                 for i in range(41)]  # fmt: skip
     for i in range(12):
         stamp = START + i * SECOND // 2
-        messages.append(("/points", bag.POINT_CLOUD, stamp + 1, cloud(stamp)))
-    listener = replayed(record(tmp_path / "drive", messages))
+        recorded.append(("/points", bag.POINT_CLOUD, stamp + 1, cloud(stamp)))
+    listener = replayed(record(tmp_path / "drive", recorded))
     assert listener.stamps_ns == [START + i * SECOND // 2 for i in range(12)]
     known = [motion is not None and motion.is_known for motion in listener.motions]
     assert known[1:5] == [True] * 4
@@ -175,13 +175,13 @@ def test_odometry_that_stops_holds_no_scan_for_ever(tmp_path: Path) -> None:
 def test_poses_that_are_none_are_left_out(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive")
     with bag.open_bag(path) as reader:
-        messages = [(t, bag.ODOMETRY if t == "/odom" else bag.POINT_CLOUD, ns, m) for t, ns, m in reader.messages()]
-    for number, (_, _, _, message) in enumerate([m for m in messages if m[0] == "/odom"]):
+        recorded = [(t, bag.ODOMETRY if t == "/odom" else bag.POINT_CLOUD, ns, m) for t, ns, m in reader.messages()]
+    for number, (_, _, _, message) in enumerate([m for m in recorded if m[0] == "/odom"]):
         if number % 4 == 1:
             message.pose.pose.position.x = float("nan")
         if number % 4 == 3:
             message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
-    listener = replayed(record(tmp_path / "broken", messages))
+    listener = replayed(record(tmp_path / "broken", recorded))
     for motion in listener.motions[1:]:
         assert motion is not None
         assert motion.is_known
@@ -189,11 +189,11 @@ def test_poses_that_are_none_are_left_out(tmp_path: Path) -> None:
 
 
 def test_odometry_of_another_frame_is_used_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    messages: list[tuple[str, str, int, Any]] = [
+    recorded: list[tuple[str, str, int, Any]] = [
         ("/odom", bag.ODOMETRY, START + i, odometry(START + i, 0.0, child="base_footprint")) for i in range(3)
     ]
-    messages.append(("/points", bag.POINT_CLOUD, START + 1, cloud(START + 1)))
-    replayed(record(tmp_path / "drive", messages))
+    recorded.append(("/points", bag.POINT_CLOUD, START + 1, cloud(START + 1)))
+    replayed(record(tmp_path / "drive", recorded))
     assert caplog.text.count("gives the pose of 'base_footprint'") == 1
 
 
@@ -219,11 +219,11 @@ def test_of_a_damaged_recording_the_scans_that_wait_are_kept(tmp_path: Path, mon
 def test_scans_tell_the_motion_themselves(tmp_path: Path) -> None:
     """All of them, also those that are not localized; on a lidar that looks to the left, in the axes of the base."""
     pytest.importorskip("kiss_icp")
-    messages: list[tuple[str, str, int, Any]] = []
+    recorded: list[tuple[str, str, int, Any]] = []
     for i in range(9):
         stamp = START + i * SECOND // 10
-        messages.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp, 0.25 * i, np.pi / 2, small=False)))
-    path = record(tmp_path / "drive", messages)
+        recorded.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp, 0.25 * i, np.pi / 2, small=False)))
+    path = record(tmp_path / "drive", recorded)
     mounting = MountingConfig(z_m=1.2, yaw_deg=90.0)
     listener = Listener(LocalizerConfig(scan=ScanConfig(mounting=mounting)))
     with bag.open_bag(path) as reader:
@@ -273,7 +273,7 @@ class Oracle(Listener):
 def test_poses_are_held_against_the_true_ones_of_the_recording(town_map: AerialMap, tmp_path: Path) -> None:
     frame = town_map.frame
     west, south, _, _ = town_map.bounds
-    messages: list[tuple[str, str, int, Any]] = []
+    recorded: list[tuple[str, str, int, Any]] = []
     truth = {}
     for i in range(20):
         stamp = START + i * SECOND // 5
@@ -281,13 +281,13 @@ def test_poses_are_held_against_the_true_ones_of_the_recording(town_map: AerialM
         place = np.array([[west + 150.0 - 4.0 * i, south + 80.0, 2.0]])
         truth[stamp] = (place[0, 0], place[0, 1], yaw)
         latitude, longitude, _ = frame.to_geographic(place)
-        fix = bag.nav_sat_fix(stamp, "base_link", latitude[0], longitude[0], float("nan"), np.zeros((3, 3)))
-        messages.append(("/ground_truth/fix", bag.NAV_SAT_FIX, stamp, fix))
+        fix = messages.nav_sat_fix(stamp, "base_link", latitude[0], longitude[0], float("nan"), np.zeros((3, 3)))
+        recorded.append(("/ground_truth/fix", bag.NAV_SAT_FIX, stamp, fix))
         x, y, _ = frame.to_enu(place)[0]
-        message = bag.odometry(stamp, "world", "base_link", (x, y, 0), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)))
-        messages.append(("/ground_truth/odom", bag.ODOMETRY, stamp, message))
-        messages.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
-    with bag.open_bag(record(tmp_path / "drive", messages)) as reader:
+        message = messages.odometry(stamp, "world", "base_link", (x, y, 0), (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)))
+        recorded.append(("/ground_truth/odom", bag.ODOMETRY, stamp, message))
+        recorded.append(("/points", bag.POINT_CLOUD, stamp, cloud(stamp)))
+    with bag.open_bag(record(tmp_path / "drive", recorded)) as reader:
         localize_bag(reader, "/points", Oracle(frame, truth), tmp_path / ESTIMATES)
         evaluation = evaluate(reader, tmp_path, town_map)
     assert evaluation.heading_topic == "/ground_truth/odom"

@@ -11,7 +11,7 @@ import pytest
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation.drives.estimates import read_estimates
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.replay.live import header_stamp_ns, localize_live
 from crossloc3d_ros.ros.conversions import in_grid
@@ -28,12 +28,12 @@ def write_drive(path: Path, world: Any) -> Path:
         for tick in range(SCANS * STEP_NS // 50_000_000):
             stamp_ns = START_NS + tick * 50_000_000
             place = (0.1 * tick, 0.0, 0.0)
-            odometry = bag.odometry(stamp_ns, "wheels", "base_link", place, (0.0, 0.0, 0.0, 1.0))
+            odometry = messages.odometry(stamp_ns, "wheels", "base_link", place, (0.0, 0.0, 0.0, 1.0))
             writer.write("/wheels", bag.ODOMETRY, stamp_ns, odometry)
         for place in range(SCANS):
             stamp_ns = START_NS + place * STEP_NS
             points = world.points(place) if place != 5 else np.full((100, 3), np.nan)
-            cloud = bag.velodyne_cloud(stamp_ns, "velodyne", points, 1.0, 0, 0.0)
+            cloud = messages.velodyne_cloud(stamp_ns, "velodyne", points, 1.0, 0, 0.0)
             writer.write("/lidar/points", bag.POINT_CLOUD, stamp_ns, cloud)
     return path
 
@@ -116,7 +116,7 @@ def test_stamps_are_read_from_serialised_messages(tmp_path: Path) -> None:
     stamps = [1, 999_999_999, 1_700_000_000_123_456_789, 2_147_483_647_000_000_001]
     with bag.BagWriter(tmp_path / "drive") as writer:
         for stamp_ns in stamps:
-            cloud = bag.velodyne_cloud(stamp_ns, "velodyne", np.zeros((1, 3)), 1.0, 0, 0.0)
+            cloud = messages.velodyne_cloud(stamp_ns, "velodyne", np.zeros((1, 3)), 1.0, 0, 0.0)
             writer.write("/points", bag.POINT_CLOUD, stamp_ns, cloud)
     with bag.open_bag(tmp_path / "drive") as reader:
         assert [header_stamp_ns(message.cdr) for message in reader.raw_messages()] == stamps

@@ -16,7 +16,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from crossloc3d_ros.errors import BagError, CrossLocError
-from crossloc3d_ros.formats import bag
+from crossloc3d_ros.formats import bag, messages
 from crossloc3d_ros.formats.bag import BagTopic, OfferedQos
 
 pytest.importorskip("rclpy")
@@ -73,7 +73,7 @@ def own_domain(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def cloud_of(i: int, points: int) -> object:
     rng = np.random.default_rng(i)
     xyz = rng.normal(size=(points, 3)).astype(np.float32)
-    return bag.velodyne_cloud(START_NS + i * STEP_NS, "velodyne", xyz, 1.0, 3, 0.0)
+    return messages.velodyne_cloud(START_NS + i * STEP_NS, "velodyne", xyz, 1.0, 3, 0.0)
 
 
 def digest_of(cloud: object) -> str:
@@ -84,7 +84,7 @@ def write_drive(path: Path, scans: int = SCANS, points: int = 30_000, storage: b
     with bag.BagWriter(path, storage) as writer:
         writer.add_topic("/velodyne_points", bag.POINT_CLOUD, OfferedQos("best_effort", "volatile", 5))
         writer.add_topic("/gnss", bag.NAV_SAT_FIX, OfferedQos("reliable", "transient_local", 1))
-        writer.write("/gnss", bag.NAV_SAT_FIX, START_NS, bag.nav_sat_fix(START_NS, "gnss", 52.5, 4.0, 43.0))
+        writer.write("/gnss", bag.NAV_SAT_FIX, START_NS, messages.nav_sat_fix(START_NS, "gnss", 52.5, 4.0, 43.0))
         for i in range(scans):
             writer.write("/velodyne_points", bag.POINT_CLOUD, START_NS + i * STEP_NS, cloud_of(i, points))
     return path

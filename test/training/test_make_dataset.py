@@ -27,7 +27,7 @@ from crossloc3d_ros.datasets.published import load_evaluation_set
 from crossloc3d_ros.datasets.recordings import Topics
 from crossloc3d_ros.errors import AerialDataError, BagError, DatasetError, TrainingError
 from crossloc3d_ros.files import work_lock
-from crossloc3d_ros.formats import cs_campus3d
+from crossloc3d_ros.formats import cs_campus3d_writer
 from crossloc3d_ros.formats.cs_campus3d import PRESETS, read_evaluation, read_info, read_training
 from crossloc3d_ros.training import make_dataset as module
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION
@@ -166,7 +166,7 @@ def test_an_interrupted_call_goes_on_and_gives_the_same(
         if len(written) == 50:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         written.append(file)
-        cs_campus3d.write_cloud(folder, file, points)
+        cs_campus3d_writer.write_cloud(folder, file, points)
 
     with monkeypatch.context() as patched:
         patched.setattr(module, "write_cloud", until_full)

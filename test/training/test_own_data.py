@@ -14,11 +14,8 @@ import pytest
 from crossloc3d_ros.config import ModelConfig, PreprocessingConfig, TrainConfig
 from crossloc3d_ros.datasets.published import open_source
 from crossloc3d_ros.errors import DatasetError, TrainingError
-from crossloc3d_ros.formats.cs_campus3d import (
-    PRESETS,
-    CloudTable,
-    QueryTable,
-    read_training,
+from crossloc3d_ros.formats.cs_campus3d import PRESETS, CloudTable, QueryTable, read_training
+from crossloc3d_ros.formats.cs_campus3d_writer import (
     write_cloud,
     write_database,
     write_info,
