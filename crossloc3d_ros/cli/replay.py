@@ -123,7 +123,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         weights = Path(config.weights) if config.weights else None
         encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
         aerial_map = AerialMap.load(config.map, encoder.fingerprint)
-        localizer = Localizer(aerial_map, encoder, config)
+        localizer = Localizer(aerial_map, encoder, config, threads=config.threads)
         remove_results(folder)
         moved = odometry_words(odometry)
         target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps; odometry: {moved}")

@@ -107,6 +107,10 @@ class _Feed:
         self._source = odometry
         self._warned = False
 
+    @property
+    def registers_scans(self) -> bool:
+        return self._session.registers_scans
+
     def take_imu(self, message: Any, recorded_ns: int) -> None:
         force = message.linear_acceleration
         self._session.add_acceleration(stamp_ns_of(message, recorded_ns), np.array([force.x, force.y, force.z]))
@@ -157,9 +161,11 @@ def _outcomes(
             elif name == odometry:
                 feed.take_odometry(message, recorded_ns)
             else:
-                cloud = feed.take_cloud(message, recorded_ns)
-                if seen % every == 0:
-                    waiting.append(cloud)
+                is_used = seen % every == 0
+                if is_used or feed.registers_scans:
+                    cloud = feed.take_cloud(message, recorded_ns)
+                    if is_used:
+                        waiting.append(cloud)
                 seen += 1
             while waiting and feed.is_ready(waiting[0], recorded_ns):
                 yield feed.localize(waiting.popleft())

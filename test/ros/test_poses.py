@@ -247,6 +247,14 @@ def test_a_scan_waits_for_the_odometry_of_its_stamp_but_not_for_a_silent_one(mon
     odometry.wait(add)  # and that without waiting, or this test would not end: its clock stands
 
 
+def test_odometry_without_scans_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    odometry = odometry_input()
+    fill(odometry, 500.0, step_s=0.02)
+    samples = odometry.drain()
+    assert len(samples) == 24_000
+    assert samples[-1].stamp_ns == STAMP_NS + 500_000_000_000, "the newest are kept"
+
+
 def test_odometry_in_another_frame_than_the_one_named_is_refused() -> None:
     odometry = odometry_input(odom_frame_id="odom_wheels")
     with pytest.raises(PoseError, match="given in 'odom', not in 'odom_wheels': set odom_frame_id to 'odom'"):
