@@ -31,9 +31,10 @@ from crossloc3d_ros.aerial_map.builder import build_map
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import ProgressDisplay, console, run
-from crossloc3d_ros.cli.demo import DRIVE_SURVEY, MAP_SURVEY, TOPIC, DemoDrive, find_surveys, make_drive
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import ScanConfig
+from crossloc3d_ros.datasets.amsterdam import DRIVE_SURVEY, MAP_SURVEY, find_surveys
+from crossloc3d_ros.datasets.amsterdam_drive import TOPIC, DemoDrive, make_drive
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.encoder.model import CAMPUS, CrossLoc3D
 from crossloc3d_ros.encoder.runtime import Encoder
@@ -72,7 +73,8 @@ def _bench(arguments: argparse.Namespace) -> None:
 
     figures += bench_builder(find_surveys(None) / MAP_SURVEY, output / "map", encoder, target)
     plan = DemoDrive(length_m=120.0)
-    make_drive(find_surveys(None) / DRIVE_SURVEY, output / "drive", plan, target)
+    with ProgressDisplay(target) as display:
+        make_drive(find_surveys(None) / DRIVE_SURVEY, output / "drive", plan, target.print, display)
     published = Encoder(CrossLoc3D(CAMPUS), encoder.preprocessing, "published")  # its size decides, not its weights
     figures += bench_golden(published, fastest, arguments.runs)
     figures += bench_scan(output / "drive", encoder, published, fastest, arguments.runs)

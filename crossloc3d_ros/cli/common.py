@@ -207,6 +207,14 @@ def read_options(kind: type[T], namespace: argparse.Namespace) -> T:
     return from_dict(kind, given)
 
 
+def options_given(namespace: argparse.Namespace, kind: type[Any]) -> dict[str, Any]:
+    """Return the arguments that are settings of `kind` and were given; paths as text."""
+    given = {name: vars(namespace).get(name) for name in kind.__dataclass_fields__}
+    return {
+        name: str(value) if isinstance(value, Path) else value for name, value in given.items() if value is not None
+    }
+
+
 def train_config(arguments: argparse.Namespace) -> TrainConfig:
     """Return the settings of a training: the group `train` of the file `--config`, changed by the options given."""
     config = from_dict(TrainConfig, read_yaml(arguments.config).get("train", {}), where="train.")

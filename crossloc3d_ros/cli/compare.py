@@ -1,4 +1,4 @@
-"""`compare`: train the paper's competitors, or its ablations, in one way and budget, and examine them in one table."""
+"""`compare`: train the paper's competitors, or its ablations, in one way and budget, and evaluate them in one table."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from crossloc3d_ros.cli import common
-from crossloc3d_ros.cli.demo import find_surveys
 from crossloc3d_ros.config import TrainConfig
+from crossloc3d_ros.datasets.amsterdam import find_surveys
 from crossloc3d_ros.datasets.benchmarks import BENCHMARKS, open_benchmark
 from crossloc3d_ros.pages.wording import percent
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from crossloc3d_ros.cli.common import (
     ProgressDisplay,
     add_options,
     add_verbosity,
     console,
+    options_given,
     read_options,
     run,
     set_up_logging,
 )
-from crossloc3d_ros.cli.replay import read_config
 from crossloc3d_ros.config import BuildConfig, DatasetConfig, MountingConfig, PreprocessingConfig
+from crossloc3d_ros.config.sources import read_node_config
 from crossloc3d_ros.datasets.recordings import Topics
 from crossloc3d_ros.training.areas import NONE, TEST, TRAINING, VALIDATION
 from crossloc3d_ros.training.make_dataset import DatasetReport, DatasetRequest, make_dataset
@@ -82,7 +82,7 @@ def _make(arguments: argparse.Namespace) -> None:
         test_boxes=tuple(tuple(box) for box in arguments.test_box),
         validation_boxes=tuple(tuple(box) for box in arguments.validation_box),
         config=read_options(DatasetConfig, arguments),
-        scan=read_config(arguments.config, _given(arguments, MountingConfig)).scan,
+        scan=read_node_config(arguments.config, options_given(arguments, MountingConfig)).scan,
         preprocessing=read_options(PreprocessingConfig, arguments),
         build=read_options(BuildConfig, arguments),
     )
@@ -106,12 +106,6 @@ def summary(report: DatasetReport) -> str:
             rows.append(("", f"read up to its damage: {recording.damage}"))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
-
-
-def _given(arguments: argparse.Namespace, kind: type[Any]) -> dict[str, Any]:
-    """Return the arguments that are settings of `kind` and were given."""
-    names = kind.__dataclass_fields__
-    return {name: value for name, value in vars(arguments).items() if name in names and value is not None}
 
 
 if __name__ == "__main__":

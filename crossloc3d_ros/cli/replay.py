@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import datetime
-import shlex
 import sys
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-import yaml
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.cli.common import (
@@ -26,33 +19,26 @@ from crossloc3d_ros.cli.common import (
     add_verbosity,
     console,
     interrupts_held,
+    options_given,
     run,
     set_up_logging,
 )
-from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig, PlayerConfig, from_dict
+from crossloc3d_ros.cli.modes.replay_publish import publish
+from crossloc3d_ros.config import AlignmentConfig, LocalizerNodeConfig, MountingConfig
+from crossloc3d_ros.config.sources import read_node_config
 from crossloc3d_ros.datasets.truth import find_truth_topic
 from crossloc3d_ros.encoder.checkpoint import load_encoder
-from crossloc3d_ros.errors import BagError, ConfigError, CrossLocError
-from crossloc3d_ros.evaluation.drives.evaluation import (
-    ESTIMATES,
-    GEOJSON,
-    SUMMARY,
-    Evaluation,
-    evaluate,
-    latency_summary,
-    write_summary,
-)
-from crossloc3d_ros.evaluation.drives.page import About, write_report
-from crossloc3d_ros.evaluation.drives.place_scores import RANKS
-from crossloc3d_ros.evaluation.drives.track_scores import LOST, TrackScores
-from crossloc3d_ros.evaluation.statistics import INDEPENDENT_M, RADII_M
-from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, open_bag
+from crossloc3d_ros.errors import BagError, ConfigError
+from crossloc3d_ros.evaluation.drives.evaluation import ESTIMATES, GEOJSON, evaluate
+from crossloc3d_ros.evaluation.drives.page import About
+from crossloc3d_ros.evaluation.drives.results import PAGE, has_rows, remove_results, write_results
+from crossloc3d_ros.evaluation.drives.terminal import result_tables
+from crossloc3d_ros.formats.bag import IMU, BagReader, open_bag
 from crossloc3d_ros.localization.localizer import Localizer
-from crossloc3d_ros.pages.wording import degrees, metres, percent
-from crossloc3d_ros.replay.recorded import OdometrySource, localize_bag
+from crossloc3d_ros.replay.recorded import Ended, OdometrySource, localize_bag
+from crossloc3d_ros.replay.sources import choose_cloud_topic, choose_odometry, odometry_words
 from crossloc3d_ros.types import Estimate
 
-PAGE = "index.html"
 ROS_ARGUMENTS = "--ros-args"
 
 
@@ -64,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(given[:at])
     ros_arguments = [argument for argument in given[at + 1 :] if argument != "--"]
     if arguments.publish:
-        return run(lambda: _publish(arguments, ros_arguments))
+        return run(lambda: publish(arguments, ros_arguments))
     if ros_arguments:
         parser.error(f"{ROS_ARGUMENTS} has a meaning with --publish only")
     if arguments.map is None and arguments.config is None:
@@ -120,22 +106,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# Localize and score
-
-
 def _replay(arguments: argparse.Namespace) -> int:
     if arguments.every < 1:
         raise ConfigError(f"--every must be at least 1, got {arguments.every}")
     target = console()
     set_up_logging(arguments.verbose, target)
-    config = read_config(arguments.config, _given(arguments, MountingConfig), _given(arguments, LocalizerNodeConfig))
-    if arguments.scope is not None:
-        config = replace(config, alignment=replace(config.alignment, scope=arguments.scope))
-    if not config.map:
-        raise ConfigError(f"--map is needed: {arguments.config} names none")
+    config = _config(arguments)
     folder = arguments.output or Path("out") / "replay" / arguments.bag.resolve().stem
-    broken: BagError | None = None
-    interrupted = False
     with open_bag(arguments.bag) as bag:
         # Everything that can be refused is refused before the long work begins.
         topic = choose_cloud_topic(bag, arguments.topic)
@@ -150,35 +127,10 @@ def _replay(arguments: argparse.Namespace) -> int:
         remove_results(folder)
         moved = odometry_words(odometry)
         target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps; odometry: {moved}")
-        with interrupts_held() as let_through, ProgressDisplay(target) as display:
-
-            def show(done: int, total: int, _: Estimate) -> None:
-                display("localize", done, total, "scans")
-                let_through()
-
-            localizer.warm_up()
-            let_through()
-            try:
-                localize_bag(
-                    bag,
-                    topic,
-                    localizer,
-                    folder / ESTIMATES,
-                    every=arguments.every,
-                    imu_topic=arguments.imu_topic,
-                    imu_time_constant_s=config.imu_time_constant_s,
-                    odometry=odometry,
-                    progress=show,
-                )
-                let_through()
-            except BagError as error:
-                broken = error  # what was read before the damage is worth its figures
-            except KeyboardInterrupt:
-                interrupted = True
-                target.print("interrupted: writing up what there is; Ctrl-C once more to leave it")
-        if not _has_rows(folder / ESTIMATES):
-            if broken is not None:
-                raise broken
+        ended = _localize(bag, topic, localizer, folder / ESTIMATES, arguments, config, odometry, target)
+        if not has_rows(folder / ESTIMATES):
+            if ended.broken is not None:
+                raise ended.broken
             return EXIT_INTERRUPTED
         evaluation = evaluate(bag, folder, aerial_map, arguments.gnss_topic)
     facts = {
@@ -189,242 +141,56 @@ def _replay(arguments: argparse.Namespace) -> int:
         "weights": encoder.fingerprint[:12],
         "run": "straight through the localizer",
     }
-    notes = []
-    if broken is not None:
-        notes.append(f"The recording is damaged; only the part before the damage is shown. {broken}")
-    if interrupted:
-        notes.append("The run was interrupted; only the scans before that are shown.")
-    write_results(folder, evaluation, aerial_map, About(f"Replay of {arguments.bag.name}", facts, tuple(notes)))
-    print_results(evaluation, Console(highlight=False))
+    write_results(folder, evaluation, aerial_map, About(f"Replay of {arguments.bag.name}", facts, ended.notes))
+    results = Console(highlight=False)
+    for table in result_tables(evaluation):
+        results.print(table)
     print(f"{folder / PAGE}\n{folder / ESTIMATES}\n{folder / GEOJSON}")
-    if broken is not None:
-        raise broken
-    return EXIT_INTERRUPTED if interrupted else 0
+    if ended.broken is not None:
+        raise ended.broken
+    return EXIT_INTERRUPTED if ended.interrupted else 0
 
 
-def choose_cloud_topic(bag: BagReader, chosen: str | None) -> str:
-    """Return the topic with the clouds: the chosen one, or the only one there is; BagError lists the topics."""
-    if chosen is not None:
-        return bag.topic(chosen, POINT_CLOUD).name
-    return bag.only_topic(POINT_CLOUD, "choose one with --topic").name
+def _config(arguments: argparse.Namespace) -> LocalizerNodeConfig:
+    mounting, others = options_given(arguments, MountingConfig), options_given(arguments, LocalizerNodeConfig)
+    config = read_node_config(arguments.config, mounting, others)
+    if arguments.scope is not None:
+        config = replace(config, alignment=replace(config.alignment, scope=arguments.scope))
+    if not config.map:
+        raise ConfigError(f"--map is needed: {arguments.config} names none")
+    return config
 
 
-def choose_odometry(
-    bag: BagReader, chosen: str | None, config: LocalizerNodeConfig, *, asked_for: bool = False
-) -> OdometrySource | None:
-    """Return what tells how the robot moved, as `config.odometry` wants it; None where nothing does.
+def _localize(
+    bag: BagReader,
+    topic: str,
+    localizer: Localizer,
+    output: Path,
+    arguments: argparse.Namespace,
+    config: LocalizerNodeConfig,
+    odometry: OdometrySource | None,
+    target: Console,
+) -> Ended:
+    with interrupts_held() as let_through, ProgressDisplay(target) as display:
 
-    `chosen` is a topic. Without one, the only topic that is not called ground truth, or `/odom` among several. A
-    recording without any is localized without odometry, unless a topic was `asked_for`: then BagError lists what there
-    is, as it does where several topics leave the choice open.
-    """
-    if chosen is not None and asked_for and config.odometry != "topic":
-        raise ConfigError(f"--odom-topic has no meaning with --odometry {config.odometry}")
-    if chosen is None and config.odometry == "none":
-        return None
-    if chosen is None and config.odometry == "scan":
-        return OdometrySource(None, config.base_frame_id)
-    if chosen is not None:
-        return OdometrySource(bag.topic(chosen, ODOMETRY).name, config.base_frame_id)
-    names = [t.name for t in bag.topics().values() if t.msgtype == ODOMETRY and "truth" not in t.name]
-    if not names:
-        if asked_for:
-            bag.only_topic(ODOMETRY, "choose one with --odom-topic")
-            raise BagError(f"{bag.path} has no odometry beside ground truth; --odom-topic takes that too")
-        return None
-    if len(names) > 1 and "/odom" not in names:
-        raise BagError(f"{bag.path} has several odometry topics ({', '.join(names)}); choose one with --odom-topic")
-    return OdometrySource("/odom" if len(names) > 1 else names[0], config.base_frame_id)
+        def show(done: int, total: int, _: Estimate) -> None:
+            display("localize", done, total, "scans")
+            let_through()
 
-
-def odometry_words(odometry: OdometrySource | None) -> str:
-    """Return for people what tells how the robot moved."""
-    if odometry is None:
-        return "none (--odometry scan makes one from the scans)"
-    return odometry.topic or "from scan to scan, KISS-ICP"
-
-
-def remove_results(folder: Path) -> None:
-    """Remove an earlier run's results, so that old figures never stand beside new ones."""
-    for name in (ESTIMATES, GEOJSON, SUMMARY, PAGE):
+        localizer.warm_up()
+        let_through()
         try:
-            (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise CrossLocError(f"cannot write into {folder}: {error}") from error
-
-
-def write_results(folder: Path, evaluation: Evaluation, aerial_map: AerialMap, about: About) -> None:
-    """Write summary and page into the folder of the estimates."""
-    write_summary(folder, evaluation, {**about.facts, "notes": list(about.notes)})
-    if not about.footer:
-        today = datetime.datetime.now(datetime.UTC).date().isoformat()
-        about = About(**{**vars(about), "footer": f"Written by crossloc3d_ros {own_version()} on {today}."})
-    write_report(folder / PAGE, evaluation, aerial_map, about)
-
-
-def print_results(evaluation: Evaluation, target: Console) -> None:
-    """Print the scores for people."""
-    table, scores = evaluation.table, evaluation.scores
-    figures = Table(title="Results", title_justify="left", show_header=False, box=box.SIMPLE)
-    figures.add_column(style="bold", no_wrap=True)
-    figures.add_column()
-    fixes = int(table.has_fix.sum())
-    figures.add_row("scans", f"{len(table):,}, of which {fixes:,} led to a fix ({fixes / max(len(table), 1):.0%})")
-    latency = latency_summary(table)
-    if latency:
-        figures.add_row("time a scan", f"median {latency['median']:.1f} ms, 95 % {latency['p95']:.1f} ms")
-    if scores is None:
-        figures.add_row("errors", "not known: the recording has no usable GNSS at the time of the scans")
-        target.print(figures)
-        return
-    error, first = scores.fix_error, scores.best_candidate_error
-    if evaluation.track is not None:
-        _add_track(figures, evaluation.track)
-    elif error.count:
-        figures.add_row("error of a fix", f"median {error.median_m:.0f} m, 95 % {error.p95_m:.0f} m")
-        figures.add_row("truth in the 95 % ellipse", f"{error.within_ellipse:.0%} of the fixes")
-    if first.count:
-        figures.add_row("error of first candidate", f"median {first.median_m:.0f} m, 95 % {first.p95_m:.0f} m")
-    figures.add_row("evidence", f"{scores.places} places at least {INDEPENDENT_M:g} m apart")
-    target.print(figures)
-    recall = Table(title="Right place among the candidates", title_justify="left", box=box.SIMPLE)
-    recall.add_column("", style="bold", no_wrap=True)
-    for radius in RADII_M:
-        recall.add_column(f"within {radius:g} m", justify="right", no_wrap=True)
-    for rank in RANKS:
-        cells = [scores.recall(rank, radius) for radius in RADII_M]
-        recall.add_row(f"AR@{rank}", *(f"{cell.share.value:.0%} (by lot {cell.chance:.0%})" for cell in cells))
-    target.print(recall)
-
-
-def _add_track(figures: Table, track: TrackScores) -> None:
-    """Add the rows of a pose that was followed."""
-    for search in track.searches:
-        if search.cause != LOST:
-            found = f"after {metres(search.travelled_m)} and {search.seconds:.1f} s"
-            figures.add_row(f"localized, {search.cause}", found if search.end is not None else "never")
-    lost = [search.travelled_m for search in track.searches if search.cause == LOST]
-    if lost:
-        longest = f", {metres(max(lost))} at most" if len(lost) > 1 else ""
-        figures.add_row("afterwards without a fix", f"{len(lost)} times, {metres(sum(lost))} in all{longest}")
-    errors = track.errors
-    if errors.count:
-        figures.add_row("error of a fix", f"median {metres(errors.median_m)}, 95 % {metres(errors.p95_m)}")
-        if errors.headings:
-            figures.add_row(
-                "error of its heading", f"median {degrees(errors.median_deg)}, 95 % {degrees(errors.p95_deg)}"
-            )
-        figures.add_row("wrong by more than 10 m", f"{errors.wrong:,} of {errors.count:,} fixes")
-        for row in track.coverage[1:2]:
-            inside = f"{percent(row.position)} of the positions, {percent(row.heading)} of the headings"
-            figures.add_row("errors inside 2 sigma", f"{inside} (should be {percent(row.expected)})")
-
-
-def read_config(
-    path: Path | None, mounting: Mapping[str, Any], others: Mapping[str, Any] | None = None
-) -> LocalizerNodeConfig:
-    """Return the localizer's settings from a node's parameter file, with `mounting` and `others` on top.
-
-    Understands `ros__parameters` under the node's name or a wildcard, nested or with dots; ConfigError names what is
-    wrong.
-    """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            document = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise ConfigError(f"cannot read {path}: {error}") from error
-        values = _parameters_of(document, path)
-    if mounting:
-        scan = values.setdefault("scan", {})
-        scan["mounting"] = {**scan.get("mounting", {}), **mounting}
-    values.update(others or {})
-    return from_dict(LocalizerNodeConfig, values)
-
-
-def _parameters_of(document: Any, path: Path) -> dict[str, Any]:
-    if not isinstance(document, dict):
-        raise ConfigError(f"{path} holds no parameters")
-    merged: dict[str, Any] = {}
-    for node, content in document.items():
-        if isinstance(content, dict) and "ros__parameters" in content:
-            if node in ("localizer", "/localizer", "/**", "/*"):
-                _merge(merged, content["ros__parameters"] or {})
-        else:
-            raise ConfigError(f"{path}: '{node}' has no 'ros__parameters'; write 'localizer: ros__parameters: ...'")
-    # What any node may be told has no meaning without a node.
-    return {key: value for key, value in merged.items() if key not in ("use_sim_time", "qos_overrides")}
-
-
-def _merge(target: dict[str, Any], source: Mapping[str, Any]) -> None:
-    for key, value in source.items():
-        head, _, rest = str(key).partition(".")
-        if rest:
-            value = {rest: value}
-        if isinstance(value, Mapping):
-            group = target.setdefault(head, {})
-            if isinstance(group, dict):
-                _merge(group, value)
-                continue
-        target[head] = value
-
-
-def _given(arguments: argparse.Namespace, kind: type[Any]) -> dict[str, Any]:
-    """Return the arguments that are settings of `kind` and were given."""
-    given = {name: vars(arguments).get(name) for name in kind.__dataclass_fields__}
-    return {name: str(v) if isinstance(v, Path) else v for name, v in given.items() if v is not None}
-
-
-def own_version() -> str:
-    """Return the version of the package."""
-    try:
-        return version("crossloc3d_ros")
-    except PackageNotFoundError:
-        return "(not installed)"
-
-
-def _has_rows(path: Path) -> bool:
-    try:
-        with path.open(encoding="utf-8") as file:
-            return sum(1 for _, _ in zip(file, range(2), strict=False)) == 2
-    except OSError:
-        return False
-
-
-# Play into ROS
-
-
-def _publish(arguments: argparse.Namespace, ros_arguments: Sequence[str]) -> None:
-    target = console()
-    set_up_logging(arguments.verbose, target)
-    try:
-        from crossloc3d_ros.ros.player import play_bag
-    except ImportError as error:
-        raise CrossLocError(
-            f"ROS 2 was not found ({error}): source /opt/ros/jazzy/setup.bash, or pip install ros-jazzy-rclpy "
-            "ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
-        ) from error
-    config = from_dict(
-        PlayerConfig,
-        {name: getattr(arguments, name) for name in ("rate", "clock", "loop", "wait_s")},
-    )
-    with open_bag(arguments.bag) as bag:
-        if arguments.topic is not None:
-            bag.topic(arguments.topic, POINT_CLOUD)
-        seconds = (bag.end_ns - bag.start_ns) / 1e9 / config.rate
-        target.print(f"{shlex.quote(str(arguments.bag))}: {bag.message_count:,} messages, {seconds:.1f} s at this rate")
-        target.print("waiting for a subscriber")
-        report = play_bag(
-            bag,
-            config,
-            topics=arguments.play_topics,
-            ros_arguments=ros_arguments,
-            on_ready=lambda: target.print("playing"),
-        )
-    print(
-        f"{report.messages:,} messages in {report.duration_s:.1f} s, late by {report.late_median_ms:.2f} ms in the "
-        f"median, {report.late_p99_ms:.2f} ms at 99 %"
-    )
+            localize_bag(
+                bag, topic, localizer, output, every=arguments.every, imu_topic=arguments.imu_topic,
+                imu_time_constant_s=config.imu_time_constant_s, odometry=odometry, progress=show,
+            )  # fmt: skip
+            let_through()
+        except BagError as error:
+            return Ended(broken=error)
+        except KeyboardInterrupt:
+            target.print("interrupted: writing up what there is; Ctrl-C once more to leave it")
+            return Ended(interrupted=True)
+    return Ended()
 
 
 if __name__ == "__main__":

@@ -71,7 +71,9 @@ def levelling_matrix(up_base: npt.NDArray[np.floating]) -> Float64Array:
         raise CloudError(f"gravity must be a finite vector with a length, got {up.tolist()}")
     x, y, z = up / length
     if z < 0.2:
-        raise CloudError(f"by the measured gravity the robot lies on its side: up is {np.round(up / length, 3).tolist()}")
+        raise CloudError(
+            f"by the measured gravity the robot lies on its side: up is {np.round(up / length, 3).tolist()}"
+        )
     # Rodrigues about the axis up x z, written out: no case distinction at zero tilt.
     k = 1.0 / (1.0 + z)
     T = np.eye(4)

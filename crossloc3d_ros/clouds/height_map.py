@@ -1,10 +1,10 @@
 """How well a scan fits a submap, without learning: heights around both, compared in every heading and near the centre.
 
 A patch becomes a square raster of the greatest heights above the ground. To match, rasters are read in rings and
-sectors around a centre. A rotation of the robot shifts the sectors, so all headings come at once by the Fourier transform
-along them; the scan is read around several centres, for the submap's centre is not where the robot stands. What fits
-best gives a distance, a heading and an offset. The idea is that of Scan Context (IROS 2018); the differences come from
-retrieving a scan from a survey that was made from above:
+sectors around a centre. A rotation of the robot shifts the sectors, so all headings come at once by the Fourier
+transform along them; the scan is read around several centres, for the submap's centre is not where the robot stands.
+What fits best gives a distance, a heading and an offset. The idea is that of Scan Context (IROS 2018); the differences
+come from retrieving a scan from a survey that was made from above:
 
 * Heights are cut off where a beam `top_deg` above the horizon passes: the survey sees the roof, the robot does not.
 * Only cells that the scan observes count: those that it hit, and the free ones before the first hit of a sector.

@@ -22,7 +22,7 @@ class HeightMapConfig:
 
 @dataclass(frozen=True)
 class VerificationConfig:
-    """How many answers are looked at again, and how far each distance counts."""
+    """How many retrieved places are reordered, and how far each distance counts."""
 
     candidates: int = option(300, "retrieved submaps of a query that are compared by height maps", low=1, high=100_000)
     weight: float = option(293.0, "weight of the height maps' distance beside the descriptors'", low=0.0, high=1e6)

@@ -23,7 +23,7 @@ from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, ScanConfig, 
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet, join_places
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.simulated import scan_places, sources_digest
-from crossloc3d_ros.errors import EvaluationError
+from crossloc3d_ros.errors import EvaluationError, MapError
 from crossloc3d_ros.simulation import mesh, real_world, route, scene, vlp16, world
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
@@ -40,23 +40,39 @@ Progress = Callable[[str, float, float, str], None]
 
 @dataclass(frozen=True)
 class AmsterdamBenchmark:
-    """How the real survey is examined."""
+    """How the real survey is evaluated."""
 
     drive_length_m: float = 600.0
     drive_speed_m_s: float = 5.0
     drive_seed: int = 3
     """Length, speed and seed are the demo's, so that it is the same drive."""
     drive_every_m: float = 5.0
-    """Between two scans asked."""
+    """Between two queries."""
     spread: int = 300
-    """Scans at places and in headings drawn by lot."""
+    """Scans at random places and in random headings."""
     spread_seed: int = 960_000
     border_m: float = 50.0
-    """The scans drawn by lot lie at least so far inside the survey of 2014."""
+    """The scans at random places lie at least so far inside the survey of 2014."""
     clearance_m: float = 1.5
     scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
     sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
     build: BuildConfig = dataclasses.field(default_factory=BuildConfig)
+
+
+def find_surveys(folder: Path | None) -> Path:
+    """Return the folder with the two surveys: the given one, or the clone's `maps/amsterdam`; MapError otherwise."""
+    choices = (
+        [folder]
+        if folder is not None
+        else [Path("maps/amsterdam"), Path(__file__).resolve().parents[2] / "maps" / "amsterdam"]
+    )
+    for choice in choices:
+        if all((choice / name).is_file() for name in (MAP_SURVEY, DRIVE_SURVEY)):
+            return choice
+    raise MapError(
+        f"{choices[0]} does not hold {MAP_SURVEY} and {DRIVE_SURVEY}; run the demo in a clone of the repository, or "
+        "name their folder with --surveys"
+    )
 
 
 AMSTERDAM = AmsterdamBenchmark()
@@ -143,7 +159,7 @@ def raw_drive(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
 
 
 def raw_spread(town: World, benchmark: AmsterdamBenchmark) -> Iterator[RawScan]:
-    """Yield scans at places and in headings drawn by lot, with poses in the town's local frame."""
+    """Yield scans at random places and in random headings, with poses in the town's local frame."""
     rng = np.random.default_rng(benchmark.spread_seed)
     poses = town.sample_poses(benchmark.spread, rng, clearance_m=benchmark.clearance_m, border_m=benchmark.border_m)
     twists = np.zeros((len(poses), 6))

@@ -50,7 +50,7 @@ def open_benchmark(
     surveys: Path | None = None,
     progress: Progress | None = None,
 ) -> EvaluationSet:
-    """Return a benchmark of `BENCHMARKS`, made for the preprocessing of the weights that are to be examined.
+    """Return a benchmark of `BENCHMARKS`, made for the preprocessing of the weights that are to be evaluated.
 
     It is kept in `data/NAME-HASH`, where the hash is that of every setting and of the simulator's towns: a set that
     was made in another way is never taken for this one. A call that was stopped goes on town by town. `surveys`: the

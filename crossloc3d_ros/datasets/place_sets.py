@@ -264,7 +264,7 @@ def load_set(folder: Path, *, verify: bool = False) -> EvaluationSet:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Return how the set in a folder was made, as `save_set` was told."""
+    """Return how the set in a folder was made, as `save_set` was given it."""
     settings = _read_manifest(folder)["settings"]
     return dict(settings)
 

@@ -4,7 +4,7 @@
     for journey in journeys_of(pose_set, drives): ...
 
 Every drive is recorded by `simulation.drive` as a bag, and kept as what the localizer takes of it. A `Journey` plays
-one or more of them after each other as if the robot had been carried from the end of one to the begin of the next:
+one or more of them after each other as if the robot had been kidnapped from the end of one to the begin of the next:
 its clock and its wheels' odometry go on and know nothing of it.
 """
 
@@ -26,18 +26,15 @@ from crossloc3d_ros.config import MountingConfig
 from crossloc3d_ros.datasets import amsterdam
 from crossloc3d_ros.datasets import benchmarks as benchmark
 from crossloc3d_ros.datasets.amsterdam import AmsterdamBenchmark
+from crossloc3d_ros.datasets.made import how_made, is_made, mark_made, whole
 from crossloc3d_ros.datasets.pose_sets import (
     AWAY,
     POSE_SETS,
     PoseSet,
     Progress,
     SimulatedPoses,
-    how_made,
-    is_made,
-    mark_made,
     placed_town,
     to_grid,
-    whole,
 )
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
 from crossloc3d_ros.datasets.simulated import sources_digest
@@ -57,7 +54,7 @@ VERSION = 1
 _START_NS = 1_700_000_000_000_000_000
 _SAMPLE_NS = 20_000_000
 DRIVES, ODOMETRY = "drives", "odometry.npz"
-CARRIED_NS = 10_000_000_000
+KIDNAPPED_NS = 10_000_000_000
 """How long it takes to carry a robot away."""
 _IMU_TIME_CONSTANT_S = 1.0
 
@@ -114,7 +111,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Journey:
-    """Stretches of drives, between which the robot is carried; before the first it knows nothing."""
+    """Stretches of drives, between which the robot is kidnapped; before the first it knows nothing."""
 
     legs: tuple[Leg, ...]
 
@@ -198,10 +195,10 @@ def open_drives(
 
 
 def journeys_of(pose_set: PoseSet, drives: Sequence[RawDrive]) -> list[Journey]:
-    """Return how the drives are examined.
+    """Return how the drives are evaluated.
 
-    Each drive from nothing to its end; from there the robot is carried to the latter two thirds of another town's
-    drive. Those off the map stand for themselves. The long drive of the demo is examined as a whole, and with new
+    Each drive from nothing to its end; from there the robot is kidnapped to the latter two thirds of another town's
+    drive. Those off the map stand for themselves. The long drive of the demo is evaluated as a whole, and with new
     starts each hundred metres.
     """
     on_map = [i for i, drive in enumerate(drives) if pose_set.on_map[drive.plan.area]]
@@ -236,8 +233,8 @@ def steps_of(journey: Journey, drives: Sequence[RawDrive]) -> list[JourneyStep]:
         stamps_ns, odometry = drive_.odometry_ns[at:], drive_.odometry[at:]
         waiting_ns = np.empty(0, np.int64)
         if number:
-            waiting_ns = np.arange(last_ns + _SAMPLE_NS, last_ns + CARRIED_NS, _SAMPLE_NS)
-            shift_ns = last_ns + CARRIED_NS - int(stamps_ns[0])
+            waiting_ns = np.arange(last_ns + _SAMPLE_NS, last_ns + KIDNAPPED_NS, _SAMPLE_NS)
+            shift_ns = last_ns + KIDNAPPED_NS - int(stamps_ns[0])
             odometry = _continued(odometry, last)
         stamps_ns = np.concatenate([waiting_ns, stamps_ns + shift_ns])
         odometry = np.concatenate([np.broadcast_to(last, (len(waiting_ns), 3)), odometry])

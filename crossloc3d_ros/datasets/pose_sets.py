@@ -1,4 +1,4 @@
-"""The sets on which poses are fitted and examined: an aerial map, and raw scans with the true pose of each.
+"""The sets on which poses are fitted and evaluated: an aerial map, and raw scans with the true pose of each.
 
     pose_set = open_pose_set("simulated_small", Path("out/benchmark"), load_encoder)
     scan = pose_set.scans[0]
@@ -15,8 +15,7 @@ import dataclasses
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,11 @@ from crossloc3d_ros.aerial_map.builder import build_map
 from crossloc3d_ros.datasets import amsterdam
 from crossloc3d_ros.datasets import benchmarks as benchmark
 from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, AmsterdamBenchmark
+from crossloc3d_ros.datasets.made import is_made, mark_made, whole
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
 from crossloc3d_ros.datasets.simulated import SIMULATED, BenchmarkTown, SimulatedBenchmark, raw_scans, sources_digest
 from crossloc3d_ros.errors import ConfigError, EvaluationError
-from crossloc3d_ros.files import atomic_path, write_atomically
+from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.simulation import survey, vlp16
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.survey import fly, write_survey
@@ -43,14 +43,14 @@ from crossloc3d_ros.workers import EncoderLoader
 _log = logging.getLogger(__name__)
 
 VERSION = 1
-MANIFEST, _MADE = "pose_set.json", "made.json"
+MANIFEST = "pose_set.json"
 ALL = "drawn by lot"
 SEAM_M = 60.0
 """How far robots stay inside of their town's square: beyond it the map shows another town."""
 _MOSAIC_ORIGIN = np.array([500_000.0, 5_800_000.0, 0.0])
 """South-western corner of every mosaic, EPSG:32631."""
 _TOWN_BEYOND_M, _BEYOND_FLOWN_M = 60.0, 20.0
-"""How far a simulated town goes on beyond the bounds that it is asked for; how much wider it is than what is flown."""
+"""How far a simulated town goes on beyond the bounds that are given; how much wider it is than what is flown."""
 
 Progress = Callable[[str, float, float, str], None]
 
@@ -393,33 +393,6 @@ def _make_map(
             progress=lambda p: report(p.stage, p.done, p.total, p.unit),
         )
     return map_folder
-
-
-@contextmanager
-def whole(folder: Path) -> Iterator[Path]:
-    """Give a folder to write in that takes the name `folder` when all went well, in place of an older one."""
-    with atomic_path(folder, EvaluationError, parents=True) as partial:
-        partial.mkdir()
-        yield partial
-
-
-def mark_made(folder: Path, settings: dict[str, Any]) -> None:
-    """Write down how the content of a folder was made, the last thing of all."""
-    (folder / _MADE).write_text(json.dumps(settings), encoding="utf-8")
-
-
-def how_made(folder: Path) -> dict[str, Any]:
-    """Return what `mark_made` has written; empty where the folder is not whole."""
-    try:
-        made = json.loads((folder / _MADE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return dict(made)
-
-
-def is_made(folder: Path, settings: dict[str, Any]) -> bool:
-    """Say whether a folder is whole and was made in this way."""
-    return how_made(folder) == settings
 
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

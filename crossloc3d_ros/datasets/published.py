@@ -116,8 +116,8 @@ def load_evaluation_set(
     else:
         queries = _joined([subset.clouds for subset in tuples.queries])
         listed = _joined(tuples.database)
-        asked = set(queries.files)
-        own = np.array([file in asked for file in listed.files], np.bool_)
+        queried = set(queries.files)
+        own = np.array([file in queried for file in listed.files], np.bool_)
         database, ground = listed.rows(~listed.is_ground), listed.rows(listed.is_ground & ~own)
     for name, clouds in (("queries", queries), ("database clouds", database)):
         if len(clouds) == 0:

@@ -1,4 +1,4 @@
-"""Scans of a recording with the places and headings that GNSS and odometry tell, to learn from and to test on."""
+"""Scans of a recording with the places and headings that GNSS and odometry measure, to learn from and to test on."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class GnssTrack:
     def locate(self, stamps_ns: npt.ArrayLike, config: DatasetConfig) -> tuple[Float64Array, list[str]]:
         """Return positions (S, 2) interpolated at the stamps and, where there is none (NaN), why; else ''.
 
-        Both fixes around a stamp must be good; nothing is carried on beyond the first and the last one.
+        Both fixes around a stamp must be good; nothing is extrapolated beyond the first and the last one.
         """
         stamps = np.atleast_1d(np.asarray(stamps_ns, dtype=np.int64))
         places = np.full((len(stamps), 2), np.nan)
@@ -118,7 +118,7 @@ class RecordedScans:
     xy_m: Float64Array
     """(S, 2) easting, northing, metres."""
     heading_rad: Float64Array
-    """(S,) of the robot's x axis, counter-clockwise from grid east; NaN where nothing tells it."""
+    """(S,) of the robot's x axis, counter-clockwise from grid east; NaN where it is not known."""
     patches: Float32Array
     """(S, n, 3) in patch units."""
     seen: int
@@ -297,8 +297,8 @@ def _way(track: GnssTrack, stamps_ns: Int64Array, config: DatasetConfig) -> npt.
 
 def _position(odometry: OdometryTrack, stamps_ns: Int64Array) -> npt.NDArray[np.complex128]:
     start = int(odometry.stamp_ns[0])
-    known, asked = (odometry.stamp_ns - start) / 1e9, (stamps_ns - start) / 1e9
-    x, y = (np.interp(asked, known, odometry.xy_m[:, axis]) for axis in range(2))
+    known, wanted = (odometry.stamp_ns - start) / 1e9, (stamps_ns - start) / 1e9
+    x, y = (np.interp(wanted, known, odometry.xy_m[:, axis]) for axis in range(2))
     return np.asarray(x + 1j * y)
 
 

@@ -55,12 +55,12 @@ class BenchmarkTown:
 
 @dataclass(frozen=True)
 class SimulatedBenchmark:
-    """A fixed set of towns and how they are examined."""
+    """A fixed set of towns and how they are evaluated."""
 
     towns: tuple[BenchmarkTown, ...]
     town_size_m: float
     queries: int
-    """Scans asked a town; those without a patch fall away."""
+    """Queries a town; those without a patch fall away."""
     ground: int
     """Scans of the ground database a town: other places, another day."""
     border_m: float = 50.0
@@ -203,7 +203,7 @@ def admitted_submaps(
 def _scans(
     town: BenchmarkTown, epoch: int, count: int, benchmark: SimulatedBenchmark, preprocessing: PreprocessingConfig
 ) -> PlaceSet:
-    """Scan the town from places and in headings drawn by lot, as the localizer prepares scans."""
+    """Scan the town from random places and in random headings, as the localizer prepares scans."""
     rng = np.random.default_rng([town.seed, 2, epoch])
     world = make_town(town.seed, town.family, benchmark.town_size_m, epoch)
     poses = world.sample_poses(

@@ -21,11 +21,11 @@ MAX_STD_M = 10.0
 MAX_GAP_S = 2.5
 """Between fixes farther apart than this in time the robot may have been anywhere."""
 MAX_SPEED_M_S = 60.0
-"""What moves faster than this, and farther than `JUMP_M`, did not drive: it was carried, or the receiver jumped."""
+"""What moves faster than this, and farther than `JUMP_M`, did not drive: it was kidnapped, or the receiver jumped."""
 JUMP_M = 10.0
 MAX_TURNED_DEG = 2.0
 """A track turned by more than this against GNSS is no truth of headings: it was started in some frame of its own."""
-_TELLING_M = 20.0
+_LEAST_SPREAD_M = 20.0
 """A way at least so long, root mean square from its middle, shows how it is turned."""
 
 
@@ -185,7 +185,7 @@ def read_heading(bag: BagReader, topic: str, truth: TruthTrack, frame: MapFrame)
 
 
 def jumped(way_m: Float64Array, seconds: Float64Array) -> BoolArray:
-    """Say (n,) which ways (n,) were too long for the time (n,) that they took: the robot was carried."""
+    """Say (n,) which ways (n,) were too long for the time (n,) that they took: the robot was kidnapped."""
     return np.asarray((way_m > JUMP_M) & (way_m > MAX_SPEED_M_S * np.maximum(seconds, 0.0)), dtype=np.bool_)
 
 
@@ -200,11 +200,11 @@ def _turned_rad(xy_m: Float64Array, grid: Float64Array, frame: MapFrame) -> floa
     place = np.column_stack([grid[known, :2], np.zeros(int(known.sum()))])
     convergence = float(frame.convergence_rad(place.mean(axis=0)[None])[0])
     true = (place[:, 0] + 1j * place[:, 1]) * np.exp(-1j * convergence)
-    told = xy_m[known, 0] + 1j * xy_m[known, 1]
-    true, told = true - true.mean(), told - told.mean()
-    if min(np.sqrt(np.mean(np.abs(true) ** 2)), np.sqrt(np.mean(np.abs(told) ** 2))) < _TELLING_M:
+    measured = xy_m[known, 0] + 1j * xy_m[known, 1]
+    true, measured = true - true.mean(), measured - measured.mean()
+    if min(np.sqrt(np.mean(np.abs(true) ** 2)), np.sqrt(np.mean(np.abs(measured) ** 2))) < _LEAST_SPREAD_M:
         return None
-    return float(np.angle(np.sum(told * np.conj(true))))
+    return float(np.angle(np.sum(measured * np.conj(true))))
 
 
 def _usable(status: int, latitude: float, longitude: float) -> bool:

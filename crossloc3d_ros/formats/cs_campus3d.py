@@ -187,7 +187,7 @@ def read_training(folder: Path, preset: Preset) -> TrainingTuples:
 
 
 def read_evaluation(folder: Path, preset: Preset, *, validation: bool = False) -> EvaluationTuples:
-    """Return databases and queries of a dataset, of its validation area with `validation`; raises as `read_training`."""
+    """Return databases and queries, of the validation area with `validation`; raises as `read_training`."""
     names = (preset.validation_database, preset.validation_queries) if validation else (preset.database, preset.queries)
     if names[0] is None or names[1] is None:
         raise DatasetError(f"a dataset of the preset '{preset.name}' has no validation area of its own")

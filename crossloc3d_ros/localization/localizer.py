@@ -47,6 +47,7 @@ class Localizer:
         self.encoder = encoder
         self._threads = threads
         self._aligner: Aligner | None = None
+        self._is_warm = False
         self._tracker = Tracker(config.fusion)
         self._schedule = SearchSchedule(config.alignment)
         self.reconfigure(config)
@@ -99,7 +100,8 @@ class Localizer:
 
     def set_prior(self, prior: PosePrior) -> None:
         """Take in what is known of the pose from outside: an operator's initial pose, a compass."""
-        self._tracker.set_prior(prior)
+        if self._aligner is not None:  # else no pose is tracked that it could belong to
+            self._tracker.set_prior(prior)
 
     def reconfigure(self, config: LocalizerConfig) -> None:
         """Use other settings from the next scan on; the hypotheses and what was read of the map are kept."""
@@ -111,6 +113,8 @@ class Localizer:
             self._aligner = None
         elif self._aligner is None:
             self._aligner = Aligner(self.aerial_map, config.alignment, threads=self._threads)
+            if self._is_warm:
+                self._aligner.warm_up()
         else:
             self._aligner.reconfigure(config.alignment)
 
@@ -134,6 +138,7 @@ class Localizer:
         up = np.array([0.0, 0.0, 1.0])
         for gravity_base in (None, up):
             self.localize(Scan(points, stamp_ns=0, frame_id="warm_up"), gravity_base)
+        self._is_warm = True
         self.reset()
 
     @property

@@ -108,11 +108,14 @@ class Session:
 
     def reconfigure(self, config: LocalizerConfig) -> None:
         """Use other settings from the next scan on; hypotheses, priors and the odometry received so far are kept."""
+        mounting = self.localizer.config.scan.mounting
         self.localizer.reconfigure(config)
         if self._odometry is not None:
             self._odometry.reconfigure(config.fusion)
         if self._scan_odometry is not None:
             self._scan_odometry.reconfigure(config.fusion, config.scan.max_range_m)
+            if config.scan.mounting != mounting:
+                self._scan_odometry.reset()  # its map lies in the base frame as it was
 
     def add_odometry(self, stamp_ns: int, T_odom_base: Float64Array) -> bool:
         """Take in a pose (4, 4) of the base in the odometry's frame, and return whether it can be used."""
@@ -129,6 +132,11 @@ class Session:
     def add_prior(self, prior: PosePrior) -> None:
         """Take in a pose that is given from outside; it counts from the next scan on."""
         self._priors.append(prior)
+
+    @property
+    def registers_scans(self) -> bool:
+        """Whether every scan has to be received, because the scans themselves are the odometry."""
+        return self._scan_odometry is not None
 
     def odometry_pose(self, stamp_ns: int) -> Float64Array | None:
         """Return `T_odom_base` (4, 4) at a stamp; None where odometry from a topic does not give it."""
@@ -164,7 +172,7 @@ class Session:
         scan, localizer = received.scan, self.localizer
 
         def motion() -> Motion | None:
-            source = self._odometry or self._scan_odometry
+            source = self._scan_odometry if self._odometry is None else self._odometry
             if source is None or localizer.stamp_ns is None:
                 return None
             if wait_for_odometry is not None and not self.has_odometry_until(scan.stamp_ns):

@@ -1,4 +1,4 @@
-"""HTML pages from the templates in `templates/`: one Jinja2 environment that escapes everything and refuses gaps.
+"""Pages from the templates in `templates/`: one Jinja2 environment that escapes all of HTML and refuses gaps.
 
 Two things alone are not escaped: charts, which `charts.Chart.render` marks as safe, and the package's own style sheets
 and scripts. Data for a page's script goes through `tojson`, which leaves no `<`, `>` or `&` in it.
@@ -36,7 +36,7 @@ def environment() -> Environment:
     """Return the environment of all pages."""
     result = Environment(
         loader=PackageLoader("crossloc3d_ros.pages"),
-        autoescape=True,
+        autoescape=lambda name: name is None or not name.endswith(".md.j2"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -53,7 +53,7 @@ def environment() -> Environment:
         "percent": wording.percent,
         "percent_range": wording.percent_range,
     }
-    result.tests["finite"] = math.isfinite
+    result.tests |= {"finite": math.isfinite, "infinite": math.isinf}
     result.globals["asset"] = _asset
     result.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return result

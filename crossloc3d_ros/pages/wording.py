@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from typing import TYPE_CHECKING
+
+from crossloc3d_ros import __version__
 
 if TYPE_CHECKING:
     from crossloc3d_ros.evaluation.statistics import Share
@@ -81,3 +84,9 @@ def rounded(value: float, digits: int) -> float | None:
 def finite(value: float) -> float:
     """Return the number, or 0 where it is not known."""
     return value if math.isfinite(value) else 0.0
+
+
+def written_by() -> str:
+    """Return the sentence that says which version wrote a page, and on which day."""
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return f"Written by crossloc3d_ros {__version__} on {today}."

@@ -36,6 +36,22 @@ class OdometrySource:
     """Odometry of another frame is used with a warning: no TF is at hand that would relate the two."""
 
 
+@dataclass(frozen=True)
+class Ended:
+    """How the localizing of a recording ended."""
+
+    broken: BagError | None = None
+    """What was read before the damage is worth its figures."""
+    interrupted: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for readers of the results."""
+        if self.broken is not None:
+            return (f"The recording is damaged; only the part before the damage is shown. {self.broken}",)
+        return ("The run was interrupted; only the scans before that are shown.",) if self.interrupted else ()
+
+
 HELD_NS = 500_000_000
 """A scan waits so long in the recording for the odometry of its stamp."""
 
@@ -91,6 +107,10 @@ class _Feed:
         self._source = odometry
         self._warned = False
 
+    @property
+    def registers_scans(self) -> bool:
+        return self._session.registers_scans
+
     def take_imu(self, message: Any, recorded_ns: int) -> None:
         force = message.linear_acceleration
         self._session.add_acceleration(stamp_ns_of(message, recorded_ns), np.array([force.x, force.y, force.z]))
@@ -141,9 +161,11 @@ def _outcomes(
             elif name == odometry:
                 feed.take_odometry(message, recorded_ns)
             else:
-                cloud = feed.take_cloud(message, recorded_ns)
-                if seen % every == 0:
-                    waiting.append(cloud)
+                is_used = seen % every == 0
+                if is_used or feed.registers_scans:
+                    cloud = feed.take_cloud(message, recorded_ns)
+                    if is_used:
+                        waiting.append(cloud)
                 seen += 1
             while waiting and feed.is_ready(waiting[0], recorded_ns):
                 yield feed.localize(waiting.popleft())

@@ -47,15 +47,13 @@ class ImuInput:
         self._heading_ns = 0
         self._acceleration: Float64Array | None = None
         self._heard_at = 0.0
-        self._warn: Callable[[str], None] = lambda text: None
+        self._log: Callable[[str], None] = lambda text: None
+        self._warned_s: dict[str, float] = {}
 
     def subscribe(self, node: Node) -> list[object]:
         """Subscribe to imu where the configuration uses it; return the subscriptions."""
 
-        def warn(text: str) -> None:
-            node.get_logger().warning(f"IMU: {text}", throttle_duration_sec=REPEAT_REASON_S)
-
-        self._warn = warn
+        self._log = node.get_logger().warning
         used = self._config.use_imu or self._config.use_imu_heading
         return [subscribe(node, Imu, "imu", self.take, qos_profile_sensor_data)] if used else []
 
@@ -68,7 +66,14 @@ class ImuInput:
             self._take_acceleration(message, R_base_imu)
             self._take_heading(message, R_base_imu)
         except CrossLocError as error:
-            self._warn(str(error))
+            self._warn(type(error).__name__, str(error))
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Log a warning, each kind no more often than every `REPEAT_REASON_S`."""
+        now_s = time.monotonic()
+        if now_s - self._warned_s.get(kind, -REPEAT_REASON_S) >= REPEAT_REASON_S:
+            self._warned_s[kind] = now_s
+            self._log(f"IMU: {text}")
 
     def state(self) -> str:
         """Return the last acceleration that could be gravity as a text."""
@@ -83,7 +88,9 @@ class ImuInput:
         if not is_gravity(acceleration):
             raise PoseError(f"{text} is no gravity; sample left out")
         if acceleration[2] < 0.0:
-            self._warn(f"{text} points down: at rest it must be +9.8 upwards, in the axes of the base (REP-145)")
+            self._warn(
+                "down", f"{text} points down: at rest it must be +9.8 upwards, in the axes of the base (REP-145)"
+            )
         self._acceleration, self._heard_at = acceleration, time.monotonic()
         if self._config.use_imu:
             self._on_acceleration(stamp_of(message), acceleration)

@@ -36,13 +36,18 @@ class InitialPoseInput:
         global_frame_id: str,
         base_frame_id: str,
         on_prior: Callable[[PosePrior], None],
+        why_unused: Callable[[], str] = lambda: "",
     ) -> None:
-        """Call `on_prior` with each initial pose that can be used; the others are logged as errors, with the reason."""
+        """Call `on_prior` with each initial pose that can be used; the others are logged as errors, with the reason.
+
+        `why_unused` returns why none can be used at present, or an empty text.
+        """
         self._node = node
         self._map = aerial_map
         self._global_frame_id = global_frame_id
         self._base_frame_id = base_frame_id
         self._on_prior = on_prior
+        self._why_unused = why_unused
         # Its own, and only once a pose needs it: the mounting of the lidar has nothing to do with it.
         self._transforms: TransformSource | None = None
         self._timer: Any = None
@@ -68,8 +73,10 @@ class InitialPoseInput:
     def take(self, message: PoseWithCovarianceStamped) -> None:
         """Take in an initial pose; a newer one replaces one that still waits for TF."""
         self._stop_waiting()
-        frame_id = message.header.frame_id
-        if frame_id == self._global_frame_id:
+        frame_id, unused = message.header.frame_id, self._why_unused()
+        if unused:
+            self._refuse(unused)
+        elif frame_id == self._global_frame_id:
             self._accept(message, np.eye(4))
         elif frame_id == EARTH_FRAME_ID:
             self._accept(message, np.asarray(np.linalg.inv(self._map.frame.pose_on_earth)))

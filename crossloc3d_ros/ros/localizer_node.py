@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,11 +22,13 @@ from std_srvs.srv import Empty
 from crossloc3d_ros.aerial_map.store import AerialMap, read_manifest
 from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.errors import ConfigError, CrossLocError
+from crossloc3d_ros.localization.fusion.odometry import require_kiss_icp
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import Session
 from crossloc3d_ros.ros.diagnostics import (
     SILENCE_S,
+    Snapshot,
     Statistics,
     diagnostic_message,
     health_status,
@@ -40,7 +42,7 @@ from crossloc3d_ros.ros.localizing import Localizing
 from crossloc3d_ros.ros.odometry_input import OdometryInput, odometry_complaint
 from crossloc3d_ros.ros.outputs import Outputs
 from crossloc3d_ros.ros.parameters import ConfigParameters
-from crossloc3d_ros.ros.transforms import TransformSource
+from crossloc3d_ros.ros.transforms import MapTransform, TransformSource
 from crossloc3d_ros.ros.worker import Worker
 from crossloc3d_ros.types import Float64Array, TrackState
 
@@ -61,6 +63,31 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config, threads=config.threads)
 
 
+class _Transforms:
+    """What the node has of TF; checked before weights and map are loaded."""
+
+    def __init__(self, node: LifecycleNode, config: LocalizerNodeConfig) -> None:
+        """Listen and announce as configured; ConfigError for what cannot be."""
+        if config.mounting_from_tf and not config.base_frame_id:
+            raise ConfigError("mounting_from_tf needs a base_frame_id")
+        if config.tf_broadcast and config.odometry != "topic":
+            raise ConfigError("tf_broadcast needs odometry from a topic: that is the frame whose pose it publishes")
+        tolerance_ns = round(1e9 * config.transform_tolerance)
+        self.map = MapTransform(node, config.global_frame_id, tolerance_ns) if config.tf_broadcast else None
+        self.source = TransformSource(node, config.base_frame_id) if config.mounting_from_tf else None
+
+    @property
+    def pose_on_base(self) -> Callable[[str], Float64Array] | None:
+        """What gives `T_base_frame` (4, 4) by the frame's name; None where TF is not used for it."""
+        return None if self.source is None else self.source.pose_on_base
+
+    def close(self) -> None:
+        """Withdraw from TF."""
+        for part in (self.map, self.source):
+            if part is not None:
+                part.close()
+
+
 @dataclass(frozen=True, eq=False)
 class _Parts:
     """What a configured node is made of."""
@@ -74,19 +101,23 @@ class _Parts:
     outputs: Outputs
     localizing: Localizing
     worker: Worker
-    transforms: TransformSource | None
+    statistics: Statistics
+    transforms: _Transforms
 
-    def subscribe(self, node: LifecycleNode) -> list[object]:
-        """Begin to listen; the clouds last, when everything beside them is there."""
-        odometry = [] if self.odometry is None else self.odometry.subscribe(node)
-        return [*odometry, *self.imu.subscribe(node), *self.initial_pose.subscribe(), *self.lidar.subscribe(node)]
+    def subscribe(self, node: LifecycleNode) -> Iterator[object]:
+        """Yield subscription after subscription; the clouds last, when everything beside them is there."""
+        if self.odometry is not None:
+            yield from self.odometry.subscribe(node)
+        yield from self.imu.subscribe(node)
+        yield from self.initial_pose.subscribe()
+        yield from self.lidar.subscribe(node)
 
     def close(self) -> None:
         """Withdraw everything from ROS."""
+        self.localizing.close()
         self.initial_pose.close()
         self.outputs.close()
-        if self.transforms is not None:
-            self.transforms.close()
+        self.transforms.close()
 
 
 class LocalizerNode(LifecycleNode):
@@ -98,7 +129,8 @@ class LocalizerNode(LifecycleNode):
         self._load = load
         self._parts: _Parts | None = None
         self._subscriptions_of_parts: list[object] = []
-        self._statistics = Statistics()
+        self._abandoned: list[Worker] = []
+        """Of earlier configurations, whose scan at work did not end."""
         self._complaint = ""
         self._stale_after: int | None = None
         """Number of scans after which the state was reported as stale."""
@@ -185,17 +217,14 @@ class LocalizerNode(LifecycleNode):
     def _configure(self) -> None:
         config = self._configuration.config
         started = time.monotonic()
-        transforms = None
-        if config.mounting_from_tf:
-            if not config.base_frame_id:
-                raise ConfigError("mounting_from_tf needs a base_frame_id")
-            transforms = TransformSource(self, config.base_frame_id)
+        if config.odometry == "scan":
+            require_kiss_icp()
+        transforms = _Transforms(self, config)
         try:
             localizer = self._load(config)
             self._parts = self._assemble(config, localizer, transforms)
         except BaseException:
-            if transforms is not None:
-                transforms.close()
+            transforms.close()
             raise
         origin = self._parts.outputs.origin
         self.get_logger().info(
@@ -204,28 +233,26 @@ class LocalizerNode(LifecycleNode):
             f"weights {localizer.encoder.fingerprint[:12]}; loaded in {time.monotonic() - started:.1f} s"
         )
 
-    def _assemble(
-        self, config: LocalizerNodeConfig, localizer: Localizer, transforms: TransformSource | None
-    ) -> _Parts:
+    def _assemble(self, config: LocalizerNodeConfig, localizer: Localizer, transforms: _Transforms) -> _Parts:
         """Bring inputs, work and outputs together."""
-        pose_on_base = None if transforms is None else transforms.pose_on_base
+        pose_on_base, statistics = transforms.pose_on_base, Statistics()
         session = Session(localizer, config.odometry, config.imu_time_constant_s)
         frames = config.base_frame_id, config.odom_frame_id
         uses_topic = config.odometry == "topic"
         odometry = OdometryInput(*frames, config.odometry_timeout_s, pose_on_base) if uses_topic else None
         frame = localizer.aerial_map.frame
-        outputs = Outputs(self, config, frame, self._status_name)
-        localizing = Localizing(session, odometry, outputs, self._statistics, self.get_logger())
+        outputs = Outputs(self, config, frame, self._status_name, transforms.map)
+        localizing = Localizing(session, odometry, outputs, statistics, self.get_logger())
         worker = Worker("localize", config.queue_depth)
 
         def offer(arrival: Arrival) -> int:
             return worker.offer(lambda: localizing.process(arrival))
 
         def on_acceleration(stamp_ns: int, acceleration: Float64Array) -> None:
-            worker.post(lambda: session.add_acceleration(stamp_ns, acceleration))
+            worker.post(lambda: session.add_acceleration(stamp_ns, acceleration), is_sample=True)
 
         def on_heading(heading: PosePrior) -> None:
-            worker.post(lambda: session.add_heading(heading))
+            worker.post(lambda: session.add_heading(heading), is_sample=True)
 
         def on_prior(prior: PosePrior) -> None:
             worker.post(lambda: session.add_prior(prior))
@@ -233,15 +260,16 @@ class LocalizerNode(LifecycleNode):
         return _Parts(
             config=config,
             localizer=localizer,
-            lidar=LidarInput(offer, self._statistics, pose_on_base),
+            lidar=LidarInput(offer, statistics, pose_on_base),
             odometry=odometry,
             imu=ImuInput(config, frame, on_acceleration, on_heading, pose_on_base),
             initial_pose=InitialPoseInput(
-                self, localizer.aerial_map, config.global_frame_id, config.base_frame_id, on_prior
+                self, localizer.aerial_map, config.global_frame_id, config.base_frame_id, on_prior, self._why_no_prior
             ),
             outputs=outputs,
             localizing=localizing,
             worker=worker,
+            statistics=statistics,
             transforms=transforms,
         )
 
@@ -251,17 +279,20 @@ class LocalizerNode(LifecycleNode):
             raise ConfigError("the node is not configured")
         started = time.monotonic()
         self.get_logger().info("warming up; the first start on a machine compiles for a while")
-        self._statistics.reset()
+        parts.statistics.reset()
         self._stale_after = None
         parts.initial_pose.reset()
+        config = self._configuration.config
 
         def prepare() -> None:
             # In the worker's own thread, because numerical libraries keep state for each thread.
+            parts.localizing.reconfigure(config)  # what has changed while nobody worked
             parts.localizer.warm_up()
             parts.localizing.reset()
 
         parts.worker.start(prepare)
-        self._subscriptions_of_parts = parts.subscribe(self)
+        for subscription in parts.subscribe(self):
+            self._subscriptions_of_parts.append(subscription)
         topic = self.resolve_topic_name("points")
         self.get_logger().info(f"warm after {time.monotonic() - started:.1f} s; listening on {topic}")
 
@@ -270,13 +301,14 @@ class LocalizerNode(LifecycleNode):
         for subscription in self._subscriptions_of_parts:
             self.destroy_subscription(subscription)
         self._subscriptions_of_parts = []
-        if self._parts is None:
-            return True
-        self._parts.initial_pose.reset()
-        ended = self._parts.worker.stop()
-        if not ended:
-            self.get_logger().error("the scan at work does not end")
-        return ended
+        if self._parts is not None:
+            self._parts.initial_pose.reset()
+            if not self._parts.worker.stop():
+                self.get_logger().error("the scan at work does not end")
+                if self._parts.worker not in self._abandoned:
+                    self._abandoned.append(self._parts.worker)
+        self._abandoned = [worker for worker in self._abandoned if not worker.stop(0.0)]
+        return not self._abandoned
 
     def _release(self) -> None:
         if self._parts is not None:
@@ -286,7 +318,7 @@ class LocalizerNode(LifecycleNode):
     # Parameters and the service
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set the parameters, all or none; a refusal names the parameter and the reason."""
+        """Set the parameters, all or none; a refusal says which one and why."""
         try:
             admitted = self._configuration.admit(parameter_list)
         except ConfigError as error:
@@ -300,16 +332,22 @@ class LocalizerNode(LifecycleNode):
             return None
         return "is read when the node is configured: clean the node up first"
 
+    def _why_no_prior(self) -> str:
+        if self._configuration.config.alignment.scope == "none":
+            return "alignment.scope is none, so that no pose is tracked"
+        return ""
+
     def _reconfigure(self) -> None:
-        """Give the localizer other settings from the next scan on."""
-        if self._parts is not None:
+        """Give the localizer other settings from the next scan on; an inactive one takes them up when activated."""
+        if self._parts is not None and self._subscriptions_of_parts:
             config, localizing = self._configuration.config, self._parts.localizing
             self._parts.worker.post(lambda: localizing.reconfigure(config))
+            self.get_logger().info("other settings hold from the next scan on")
 
     def _reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
         """Forget everything that earlier messages left behind."""
         if self._parts is not None:
-            self._statistics.dropped(self._parts.worker.drop_scans())
+            self._parts.statistics.dropped(self._parts.worker.drop_scans())
             self._parts.initial_pose.reset()
             self._parts.worker.post(self._parts.localizing.reset)
             self.get_logger().info("localizing anew")
@@ -322,8 +360,7 @@ class LocalizerNode(LifecycleNode):
         return f"{self.get_fully_qualified_name().lstrip('/')}: localization"
 
     def _publish_diagnostics(self) -> None:
-        snapshot = self._statistics.snapshot()
-        values = snapshot_values(snapshot)
+        values = snapshot_values(self._snapshot())
         values["map"] = self._configuration.config.map
         level, message = self._health(values)
         stamp_ns = self.get_clock().now().nanoseconds
@@ -331,7 +368,7 @@ class LocalizerNode(LifecycleNode):
 
     def _health(self, values: dict[str, str]) -> tuple[bytes, str]:
         """Return level and message of the diagnostics, and add to their values what the parts report."""
-        parts, snapshot = self._parts, self._statistics.snapshot()
+        parts, snapshot = self._parts, self._snapshot()
         if parts is not None:
             values["submaps"] = str(len(parts.localizer.aerial_map.submaps.grid))
             values["encoder"] = parts.localizer.encoder.fingerprint
@@ -340,6 +377,8 @@ class LocalizerNode(LifecycleNode):
         if parts is None or not self._subscriptions_of_parts:
             if self._complaint:
                 return DiagnosticStatus.ERROR, self._complaint
+            if self._abandoned:
+                return DiagnosticStatus.ERROR, "the scan that was at work does not end: restart the node"
             return DiagnosticStatus.OK, "not configured" if parts is None else "inactive"
         complaint = ""
         if parts.odometry is not None:
@@ -353,14 +392,19 @@ class LocalizerNode(LifecycleNode):
         if stall:
             self._report_stale(stall)
             return DiagnosticStatus.ERROR, stall
-        level, message = health_status(snapshot, points, self.count_publishers(points), parts.lidar.complaint, complaint)
+        level, message = health_status(
+            snapshot, points, self.count_publishers(points), parts.lidar.complaint, complaint
+        )
         if snapshot.silent_s > SILENCE_S:
             self._report_stale(message)
         return level, message
 
+    def _snapshot(self) -> Snapshot:
+        return (Statistics() if self._parts is None else self._parts.statistics).snapshot()
+
     def _report_stale(self, reason: str) -> None:
-        """Report once, after the last scan, that the latched state is no longer current."""
-        snapshot = self._statistics.snapshot()
+        """Say once, after the last scan, that the latched state is no longer current."""
+        snapshot = self._snapshot()
         if self._parts is None or self._stale_after == snapshot.processed:
             return
         self._stale_after = snapshot.processed

@@ -21,7 +21,7 @@ from crossloc3d_ros.types import FixStatus
 
 
 class Localizing:
-    """Own a session: every method but the constructor runs in the worker's thread, and nothing else changes it."""
+    """Own a session: every method but `close` runs in the worker's thread, and nothing else changes it."""
 
     def __init__(
         self,
@@ -39,6 +39,11 @@ class Localizing:
         self._log = log
         self._odom_frame_id = ""
         self._last_status: FixStatus | None = None
+        self._is_closed = False
+
+    def close(self) -> None:
+        """Let a scan that still is at work go without a trace; called from the executor's thread."""
+        self._is_closed = True
 
     def reset(self) -> None:
         """Localize anew: forget all but the odometry."""
@@ -48,11 +53,12 @@ class Localizing:
     def reconfigure(self, config: LocalizerConfig) -> None:
         """Use other settings from the next scan on."""
         self._session.reconfigure(config)
-        self._log.info("other settings are in use")
 
     def process(self, arrival: Arrival) -> None:
         """Localize one cloud, publish, count and log the outcome."""
         outcome = self._localize(arrival)
+        if self._is_closed:
+            return
         estimate = outcome.estimate
         T_odom_base = self._session.odometry_pose(estimate.stamp_ns)
         try:
@@ -67,11 +73,10 @@ class Localizing:
         """Return the outcome of a cloud; every failure becomes an estimate without a fix, with its reason."""
         session, stamp_ns = self._session, stamp_of(arrival.message)
         try:
+            for sample in [] if self._odometry is None else self._odometry.drain():
+                self._add_odometry(sample)
             if arrival.fault:
                 return session.fault(stamp_ns, arrival.fault)
-            if self._odometry is not None:
-                for sample in self._odometry.drain():
-                    self._add_odometry(sample)
             received = session.receive(scan_from_pointcloud2(arrival.message), arrival.T_base_lidar)
             return session.localize(received, self._wait_for_odometry)
         except CrossLocError as error:

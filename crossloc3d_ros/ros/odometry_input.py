@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import queue
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +22,8 @@ from crossloc3d_ros.types import Float64Array
 
 SILENCE_S = 1.0
 """A source that has been silent for so long is not waited for, and is reported."""
+_KEPT = 24_000
+"""Samples that wait for a scan at most: two minutes at 200 Hz, as long as odometry is kept for scans."""
 QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Receives from reliable publishers too; deep, because a second of 200 Hz may wait while this process has no time."""
 
@@ -65,7 +68,8 @@ class OdometryInput:
         self._odom_frame_id = odom_frame_id
         self._timeout_s = timeout_s
         self._pose_on_base = pose_on_base
-        self._samples: queue.SimpleQueue[OdometrySample] = queue.SimpleQueue()
+        self._arrived = threading.Condition()
+        self._samples: deque[OdometrySample] = deque(maxlen=_KEPT)
         self._messages = 0
         self._heard_at = time.monotonic()
         self._complaint = ""
@@ -93,7 +97,9 @@ class OdometryInput:
         self._complaint = ""
         self._messages += 1
         self._heard_at = time.monotonic()
-        self._samples.put(sample)
+        with self._arrived:
+            self._samples.append(sample)
+            self._arrived.notify()
 
     def state(self) -> OdometryState:
         """Return what has been received until now."""
@@ -103,21 +109,21 @@ class OdometryInput:
 
     def drain(self) -> list[OdometrySample]:
         """Return the samples that have arrived since the last call, in their order."""
-        samples = []
-        while True:
-            try:
-                samples.append(self._samples.get_nowait())
-            except queue.Empty:
-                return samples
+        with self._arrived:
+            samples = list(self._samples)
+            self._samples.clear()
+        return samples
 
     def wait(self, add: Callable[[OdometrySample], bool]) -> None:
         """Hand samples to `add` as they arrive until it returns True, the timeout ends or odometry is silent."""
         deadline = time.monotonic() + self._timeout_s
         while time.monotonic() - self._heard_at < SILENCE_S:
-            try:
-                sample = self._samples.get(timeout=max(deadline - time.monotonic(), 0.0))
-            except queue.Empty:
-                return
+            with self._arrived:
+                if not self._samples:
+                    self._arrived.wait(max(deadline - time.monotonic(), 0.0))
+                if not self._samples:
+                    return
+                sample = self._samples.popleft()
             if add(sample):
                 return
 

@@ -14,7 +14,6 @@ from sensor_msgs.msg import NavSatFix, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from crossloc3d_ros.config import LocalizerNodeConfig
-from crossloc3d_ros.errors import ConfigError
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.ros.conversions import (
     candidate_table_message,
@@ -45,13 +44,17 @@ _ON_DEMAND: dict[str, Callable[[Estimate, MapFrame, str], Any]] = {
 class Outputs:
     """The publishers of one configured node; they are set up once and not changed afterwards."""
 
-    def __init__(self, node: LifecycleNode, config: LocalizerNodeConfig, frame: MapFrame, status_name: str) -> None:
-        """Announce the topics and publish the map's origin; ConfigError where TF is wanted and not installed."""
-        if config.tf_broadcast and config.odometry != "topic":
-            raise ConfigError("tf_broadcast needs odometry from a topic: that is the frame whose pose it publishes")
+    def __init__(
+        self,
+        node: LifecycleNode,
+        config: LocalizerNodeConfig,
+        frame: MapFrame,
+        status_name: str,
+        transform: MapTransform | None,
+    ) -> None:
+        """Announce the topics and publish the map's origin; `transform` where TF is to be published too."""
         self._node, self._config, self._frame, self._status_name = node, config, frame, status_name
-        tolerance_ns = round(1e9 * config.transform_tolerance)
-        self._transform = MapTransform(node, config.global_frame_id, tolerance_ns) if config.tf_broadcast else None
+        self._transform = transform
         self._publishers: dict[str, Any] = {
             "fix": node.create_lifecycle_publisher(NavSatFix, "~/fix", 10),
             "pose": node.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),
@@ -87,10 +90,7 @@ class Outputs:
         """Withdraw all topics."""
         for publisher in self._publishers.values():
             self._node.destroy_lifecycle_publisher(publisher)
-        self._publishers = {}
         self._node.destroy_publisher(self._origin_publisher)
-        if self._transform is not None:
-            self._transform.close()
 
     def _publish_transform(self, estimate: Estimate, T_odom_base: Float64Array | None, odom_frame_id: str) -> None:
         """Publish the odometry's frame in the map (REP-105) while localized."""

@@ -106,8 +106,8 @@ class Player:
                 )
             self._tick(self._bag.start_ns)
             time.sleep(0.02)
-        # Discovery has two ends: that we have discovered the subscriber does not mean that it has discovered us, and best effort loses
-        # what comes before.
+        # Discovery has two ends: that we have discovered the subscriber does not mean that it has discovered us, and
+        # best effort loses what comes before.
         settled = time.monotonic() + _SETTLE_S
         while time.monotonic() < settled:
             self._tick(self._bag.start_ns)

@@ -12,15 +12,31 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
 
 from crossloc3d_ros.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
 MAX_WAITING = 20_000
-"""Commands kept for a worker that hangs: a hundred seconds of an IMU at 200 Hz. Beyond, the oldest are dropped."""
+"""Tasks kept for a worker that hangs: a hundred seconds of an IMU at 200 Hz. Beyond, the oldest samples are dropped."""
 
 Task = Callable[[], object]
+
+
+class _Kind(Enum):
+    SCAN = "scan"
+    """Dropped where too many wait."""
+    SAMPLE = "sample"
+    """Of a sensor beside the scans: the oldest are dropped where a worker hangs."""
+    COMMAND = "command"
+    """Never dropped."""
+
+
+class _Waiting(NamedTuple):
+    task: Task
+    kind: _Kind
 
 
 @dataclass(frozen=True)
@@ -43,8 +59,7 @@ class Worker:
         self._name = name
         self._queue_depth = queue_depth
         self._changed = threading.Condition()
-        self._waiting: deque[tuple[Task, bool]] = deque()
-        """Tasks, and whether each is a scan."""
+        self._waiting: deque[_Waiting] = deque()
         self._thread: threading.Thread | None = None
         self._abandoned: threading.Thread | None = None
         self._busy_since: float | None = None
@@ -81,17 +96,22 @@ class Worker:
     def offer(self, scan: Task) -> int:
         """Hand over the work on a scan; return how many waiting scans were dropped for it."""
         with self._changed:
-            waiting = sum(is_scan for _, is_scan in self._waiting)
+            waiting = sum(item.kind is _Kind.SCAN for item in self._waiting)
             dropped = waiting if waiting >= self._queue_depth else 0
             if dropped:
                 self._drop_scans()
-            self._put(scan, is_scan=True)
+            self._put(_Waiting(scan, _Kind.SCAN))
         return dropped
 
-    def post(self, command: Task) -> None:
-        """Hand over a command: it runs after the scans that came before it, and is not dropped with them."""
+    def post(self, command: Task, *, is_sample: bool = False) -> None:
+        """Hand over a command: it runs after the scans that came before it, and is not dropped with them.
+
+        `is_sample`: the sample of a sensor, of which the oldest are dropped where `MAX_WAITING` tasks wait.
+        """
         with self._changed:
-            self._put(command, is_scan=False)
+            if is_sample and len(self._waiting) >= MAX_WAITING:
+                self._drop_oldest_sample()
+            self._put(_Waiting(command, _Kind.SAMPLE if is_sample else _Kind.COMMAND))
 
     def drop_scans(self) -> int:
         """Drop the scans that wait and return how many there were."""
@@ -112,22 +132,24 @@ class Worker:
             self._waiting.clear()
             self._changed.notify()
         if thread is None:
-            return True
+            return self._abandoned is None or not self._abandoned.is_alive()
         thread.join(timeout_s)
         self._abandoned = thread
         return not thread.is_alive()
 
-    def _put(self, task: Task, *, is_scan: bool) -> None:
-        if len(self._waiting) >= MAX_WAITING:
-            self._waiting.popleft()
-        self._waiting.append((task, is_scan))
+    def _put(self, item: _Waiting) -> None:
+        self._waiting.append(item)
         self._changed.notify()
 
+    def _drop_oldest_sample(self) -> None:
+        oldest = next((i for i, item in enumerate(self._waiting) if item.kind is _Kind.SAMPLE), None)
+        if oldest is not None:
+            del self._waiting[oldest]
+
     def _drop_scans(self) -> int:
-        commands = [item for item in self._waiting if not item[1]]
-        dropped = len(self._waiting) - len(commands)
-        self._waiting.clear()
-        self._waiting.extend(commands)
+        others = [item for item in self._waiting if item.kind is not _Kind.SCAN]
+        dropped = len(self._waiting) - len(others)
+        self._waiting = deque(others)
         return dropped
 
     def _loop(self) -> None:
@@ -138,7 +160,7 @@ class Worker:
                     self._changed.wait()
                 if self._thread is not me:
                     return
-                task, _ = self._waiting.popleft()
+                task = self._waiting.popleft().task
                 self._busy_since = time.monotonic()
             try:
                 task()

@@ -2,7 +2,8 @@
 
 First the log likelihood ratios: how often a beam was returned from a cell, by what the aerial map shows there, and how
 often beams come inside of what the map shows closed, at true poses and at others. Then the calibration: every scan is
-sought on the whole map, and the scores of its best poses, right, wrong or off the map, calibrate the probability of a score.
+aligned on the whole map, and the scores of its best poses, right, wrong or off the map, calibrate the probability of a
+score.
 """
 
 from __future__ import annotations

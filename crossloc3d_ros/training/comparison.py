@@ -32,11 +32,11 @@ from crossloc3d_ros.evaluation.retrieval.predictions import (
     save_predictions,
     way_of,
 )
-from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
 from crossloc3d_ros.evaluation.retrieval.scores import difference, score
 from crossloc3d_ros.evaluation.statistics import Recall, Share, find_recall
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.training import run_folder
+from crossloc3d_ros.training.handcrafted import HeightMaps, ScanContext
 from crossloc3d_ros.training.loop import Progress, Trainer
 from crossloc3d_ros.training.material import read_material
 from crossloc3d_ros.training.schedule import Budget
@@ -78,7 +78,7 @@ class Result:
     slug: str
     name: str
     encoder: str
-    """Fingerprint of the evaluation set."""
+    """Fingerprint of what was evaluated."""
     data: str
     """Fingerprint of the benchmark's set."""
     descriptor_size: int
@@ -223,7 +223,7 @@ class Comparison:
     budget: Budget
     evaluation_set: EvaluationSet
     preprocessing: PreprocessingConfig
-    """Of the set's patches: for the methods that have none of their own."""
+    """Of the set's patches: for the methods that carry none of their own."""
     cache: Path
     """Folder in which descriptors are kept."""
     workers: int = 1

@@ -6,11 +6,11 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
-from importlib import resources
 from pathlib import Path
 
+from crossloc3d_ros.evaluation.statistics import Recall
 from crossloc3d_ros.files import write_atomically
+from crossloc3d_ros.pages.render import render_page
 from crossloc3d_ros.training.comparison import RADII_M, RANKS, Result
 
 CSV, MARKDOWN, HTML = "comparison.csv", "comparison.md", "comparison.html"
@@ -18,11 +18,26 @@ CSV, MARKDOWN, HTML = "comparison.csv", "comparison.md", "comparison.html"
 
 @dataclass(frozen=True)
 class TableTexts:
-    """Title and facts above a table."""
+    """What is said above a table."""
 
     title: str
     facts: tuple[str, ...]
     """Sentences on the data, the budget and the recipe."""
+
+
+@dataclass(frozen=True)
+class ComparisonPage:
+    """What the templates of the table know."""
+
+    title: str
+    facts: tuple[str, ...]
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    """The cells of each result."""
+    recalls: Sequence[Recall]
+    """R@1 within 100 m of each result."""
+    first: Sequence[Recall]
+    """All recalls of the first result, for their chance levels; empty without results."""
 
 
 def write_tables(folder: Path, results: Sequence[Result], texts: TableTexts) -> list[Path]:
@@ -65,43 +80,24 @@ def as_csv(results: Sequence[Result]) -> str:
 
 def as_markdown(results: Sequence[Result], texts: TableTexts) -> str:
     """Return the table for people."""
-    head, *body = _cells(results)
-    lines = [f"# {texts.title}", "", *(f"* {fact}" for fact in texts.facts), ""]
-    lines += [f"| {' | '.join(head)} |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    lines += [f"| {' | '.join(row)} |" for row in body]
-    return "\n".join([*lines, "", *_notes(results), ""])
+    return render_page("comparison.md.j2", _page(results, texts))
 
 
 def as_html(results: Sequence[Result], texts: TableTexts) -> str:
     """Return the table as a page that needs nothing but itself."""
-    head, *body = _cells(results)
-    best = max((result.recall(1, 100.0).share.value for result in results), default=0.0)
-    style = (resources.files("crossloc3d_ros.pages") / "assets" / "page.css").read_text(encoding="utf-8")
-    rows = []
-    for result, cells in zip(results, body, strict=True):
-        width = 100.0 * result.recall(1, 100.0).share.value
-        mark = "best" if result.recall(1, 100.0).share.value == best else ""
-        bar = f'<td><span class="bar" style="width:{width:.1f}px"></span></td>'
-        rows.append(f'<tr class="{mark}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}{bar}</tr>')
-    return (
-        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{escape(texts.title)}</title>\n'
-        f"<style>{style}{_STYLE}</style>\n<main><h1>{escape(texts.title)}</h1>\n"
-        f"<ul>{''.join(f'<li>{escape(fact)}</li>' for fact in texts.facts)}</ul>\n"
-        f'<div class="wide"><table><thead><tr>{"".join(f"<th>{escape(cell)}</th>" for cell in head)}'
-        f"<th>R@1 100 m</th></tr></thead>\n<tbody>{''.join(rows)}</tbody></table></div>\n"
-        f"{''.join(f'<p>{escape(note)}</p>' for note in _notes(results))}</main></html>\n"
+    return render_page("comparison.html.j2", _page(results, texts))
+
+
+def _page(results: Sequence[Result], texts: TableTexts) -> ComparisonPage:
+    head, *rows = _cells(results)
+    return ComparisonPage(
+        title=texts.title,
+        facts=texts.facts,
+        head=head,
+        rows=rows,
+        recalls=[result.recall(1, 100.0) for result in results],
+        first=[results[0].recall(rank, radius) for radius in RADII_M for rank in RANKS] if results else [],
     )
-
-
-_STYLE = """
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
-th, td { padding: .35em .7em; border-bottom: 1px solid var(--rule); text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-td:last-child { text-align: left; }
-.bar { display: inline-block; height: .7em; background: var(--accent); }
-.best { font-weight: 650; }
-.wide { overflow-x: auto; }
-"""
 
 
 def _cells(results: Sequence[Result]) -> list[list[str]]:
@@ -135,17 +131,3 @@ def _cells(results: Sequence[Result]) -> list[list[str]]:
             cells.append(f"{result.published[0]:.1f}" if result.published else "")
         table.append(cells)
     return table
-
-
-def _notes(results: Sequence[Result]) -> list[str]:
-    if not results:
-        return ["No row is done yet."]
-    recalls = [results[0].recall(rank, radius) for radius in RADII_M for rank in RANKS]
-    chances = ", ".join(f"{r.label} {r.radius_m:.0f} m {100 * r.chance:.1f} %" for r in recalls)
-    return [
-        f"Recall in per cent with its 95 % interval; chance level: {chances}.",
-        "Milliseconds: the median to encode one query in all the headings that the method tries, on the CPU, and to "
-        "search the whole database; other work on the machine makes them longer.",
-        "Against the reference: difference of R@1 at 100 m on the same queries in points; an interval without 0 "
-        "means that one is ahead.",
-    ]

@@ -3,23 +3,60 @@
 from __future__ import annotations
 
 import math
-from html import escape
-from importlib import resources
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
-from crossloc3d_ros.config import TrainConfig
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.evaluation.statistics import Share
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.pages import charts
+from crossloc3d_ros.pages.render import render_page
 from crossloc3d_ros.training import run_folder
 from crossloc3d_ros.types import Float64Array
 
-_RECALLS = (("R@1", 100.0), ("R@1", 50.0), ("R@1", 25.0), ("R@25", 100.0))
+RECALLS = (("R@1", 100.0), ("R@1", 50.0), ("R@1", 25.0), ("R@25", 100.0))
 _MOST_POINTS = 300  # of a curve: more than its width in pixels shows
 _RELOAD_S = 60  # of a page while training runs
+
+
+@dataclass(frozen=True)
+class Validation:
+    """One validation of a run."""
+
+    hours: float
+    step: int
+    recalls: tuple[Share, ...]
+    """As `RECALLS`."""
+
+
+@dataclass(frozen=True)
+class CurvePage:
+    """What the template of the page knows."""
+
+    run: str
+    reload_s: int | None
+    step: int
+    hours: float
+    budget: str | None
+    loss: float
+    loss_name: str
+    learning_rate: float
+    clouds_per_s: float
+    clouds: int
+    resumed: int
+    processor: str
+    accelerator: str
+    validations: tuple[Validation, ...]
+    recall_chart: Markup | None
+    loss_chart: Markup
+    rate_chart: Markup
+    speed_chart: Markup
+    recalls: tuple[tuple[str, float], ...] = RECALLS
+    """Label and radius in metres."""
 
 
 def write_curve(folder: Path, path: Path | None = None, *, live: bool = False) -> Path:
@@ -42,48 +79,32 @@ def curve_page(folder: Path, *, live: bool = False) -> str:
     starts = [entry for entry in entries if entry["kind"] == "start"]
     if not steps or not starts:
         raise TrainingError(f"the run in {folder} has not logged a step yet")
-    last = steps[-1]
     end_h = max(entry["elapsed_s"] for entry in (*steps, *validations)) / 3600.0
-    title = f"Training: {folder.resolve().name}"
-    facts = _facts(config, starts, last, end_h)
-    reload = f'<meta http-equiv="refresh" content="{_RELOAD_S}">' if live else ""
-    body = "".join(
-        [
-            f"<header><h1>{escape(title)}</h1>",
-            f'<ul class="facts">{"".join(f"<li>{k} <b>{escape(v)}</b></li>" for k, v in facts.items())}</ul></header>',
-            '<section><h2>What it reaches on places that training never sees, and the loss</h2><div class="pair">',
-            f"<div>{_recall_chart(validations, end_h)}{_legend()}</div>" if validations else "",
-            f"<div>{_loss_chart(steps, end_h)}</div></div></section>",
-            f"<section><h2>Validations</h2>{_table(validations)}</section>" if validations else "",
-            f'<section><h2>Rate</h2><div class="pair"><div>{_rate_chart(steps, end_h)}</div>',
-            f"<div>{_speed_chart(steps, end_h)}</div></div></section>",
-        ]
+    last, hours = steps[-1], _hours(steps)
+    losses = np.array([entry["loss"] for entry in steps])
+    rates = np.array([1000.0 * entry["rate"] for entry in steps])
+    speeds = np.array([entry["samples_per_s"] for entry in steps])
+    page = CurvePage(
+        run=folder.resolve().name,
+        reload_s=_RELOAD_S if live else None,
+        step=last["step"],
+        hours=end_h,
+        budget=starts[-1].get("budget"),
+        loss=last["loss"],
+        loss_name=config.loss,
+        learning_rate=last["rate"],
+        clouds_per_s=last["samples_per_s"],
+        clouds=last.get("clouds", 2 * config.pairs * last["step"]),
+        resumed=len(starts) - 1,
+        processor=starts[-1]["processor"],
+        accelerator=starts[-1]["accelerator"],
+        validations=tuple(_validation(entry) for entry in validations),
+        recall_chart=_recall_chart(validations, end_h) if validations else None,
+        loss_chart=_series_chart(hours, losses, end_h, "training loss", "Training loss over the hours"),
+        rate_chart=_series_chart(hours, rates, end_h, "learning rate × 1000", "Learning rate over the hours"),
+        speed_chart=_series_chart(hours, speeds, end_h, "clouds a second", "Clouds a second over the hours"),
     )
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{reload}'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="color-scheme" content="light dark"><title>{escape(title)}</title>'
-        f"<style>{_style()}</style></head><body><main>{body}</main></body></html>\n"
-    )
-
-
-def _facts(config: TrainConfig, starts: list[dict[str, Any]], last: dict[str, Any], end_h: float) -> dict[str, str]:
-    return {
-        "step": f"{last['step']:,}",
-        "hours": f"{end_h:.2f}",
-        "budget": starts[-1].get("budget", "unknown"),
-        "loss": f"{last['loss']:.4f} ({config.loss})",
-        "learning rate": f"{last['rate']:.2e}",
-        "clouds a second": f"{last['samples_per_s']:.1f}",
-        "clouds": f"{last.get('clouds', 2 * config.pairs * last['step']):,}",
-        "resumed": f"{len(starts) - 1} times",
-        "machine": f"{starts[-1]['processor']}, accelerator: {starts[-1]['accelerator']}",
-    }
-
-
-def _style() -> str:
-    pages = resources.files("crossloc3d_ros.pages") / "assets"
-    return "".join((pages / name).read_text(encoding="utf-8") for name in ("page.css", "benchmark.css"))
+    return render_page("curve.html.j2", page)
 
 
 def _hours(entries: list[dict[str, Any]]) -> Float64Array:
@@ -96,60 +117,27 @@ def _thinned(hours: Float64Array, values: Float64Array) -> tuple[Float64Array, F
     return np.array([hours[part].mean() for part in parts]), np.array([values[part].mean() for part in parts])
 
 
-def _series_chart(hours: Float64Array, values: Float64Array, end_h: float, label: str, title: str) -> str:
+def _series_chart(hours: Float64Array, values: Float64Array, end_h: float, label: str, title: str) -> Markup:
     chart = charts.Chart(
         charts.linear_axis(0.0, end_h, "hours"), charts.linear_axis(0.0, float(values.max()) * 1.05, label), title
     )
     return chart.render([chart.line(*_thinned(hours, values), "c-0")])
 
 
-def _loss_chart(steps: list[dict[str, Any]], end_h: float) -> str:
-    losses = np.array([entry["loss"] for entry in steps])
-    return _series_chart(_hours(steps), losses, end_h, "training loss", "Training loss over the hours")
-
-
-def _rate_chart(steps: list[dict[str, Any]], end_h: float) -> str:
-    rates = np.array([1000.0 * entry["rate"] for entry in steps])
-    return _series_chart(_hours(steps), rates, end_h, "learning rate × 1000", "Learning rate over the hours")
-
-
-def _speed_chart(steps: list[dict[str, Any]], end_h: float) -> str:
-    speeds = np.array([entry["samples_per_s"] for entry in steps])
-    return _series_chart(_hours(steps), speeds, end_h, "clouds a second", "Clouds a second over the hours")
-
-
-def _recall_chart(validations: list[dict[str, Any]], end_h: float) -> str:
+def _recall_chart(validations: list[dict[str, Any]], end_h: float) -> Markup:
     chart = charts.Chart(charts.linear_axis(0.0, end_h, "hours"), charts.share_axis("recall"), "Recall over the hours")
     hours = _hours(validations)
     marks = []
-    for number, measure in enumerate(_RECALLS):
+    for number, measure in enumerate(RECALLS):
         values = np.array([_recall(entry, *measure)["value"] for entry in validations])
         marks += [chart.line(hours, values, f"c-{number}"), chart.dots(hours, values, ["truth"] * len(hours), 2.0)]
     return chart.render(marks)
 
 
-def _legend() -> str:
-    keys = "".join(
-        f'<span><i class="key stroke k-{number}"></i>{label} {radius:.0f} m</span>'
-        for number, (label, radius) in enumerate(_RECALLS)
-    )
-    return f'<p class="below">{keys}</p>'
-
-
-def _table(validations: list[dict[str, Any]]) -> str:
-    head = "".join(f"<th>{label} {radius:.0f} m</th>" for label, radius in _RECALLS)
-    rows = []
-    for entry in reversed(validations):
-        cells = []
-        for measure in _RECALLS:
-            recall = _recall(entry, *measure)
-            low, high = 100 * recall["low"], 100 * recall["high"]
-            cells.append(f"<td>{100 * recall['value']:.1f} % <small>{low:.1f} to {high:.1f}</small></td>")
-        rows.append(f"<tr><td>{entry['elapsed_s'] / 3600:.2f}</td><td>{entry['step']:,}</td>{''.join(cells)}</tr>")
-    return (
-        f'<div class="scroll"><table class="recall"><thead><tr><th>hours</th><th>step</th>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
+def _validation(entry: dict[str, Any]) -> Validation:
+    recalls = (_recall(entry, *measure) for measure in RECALLS)
+    shares = tuple(Share(recall["value"], recall["low"], recall["high"]) for recall in recalls)
+    return Validation(entry["elapsed_s"] / 3600.0, entry["step"], shares)
 
 
 def _recall(entry: dict[str, Any], label: str, radius_m: float) -> dict[str, Any]:

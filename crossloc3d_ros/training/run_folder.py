@@ -213,9 +213,10 @@ def metadata(
 ) -> dict[str, str]:
     """Return what travels with the weights beside model and preprocessing: how they came about, and the distances.
 
-    `examined` is the whole validation; `headings` and `turns` (test-time rotations) are how a query is encoded, `history` which weights the
-    run began with (`chain`). `distances` holds the quantiles of the descriptor distance to the right submap and to the
-    nearest wrong one on the held-out towns, `credibility` the calibration of the localizer.
+    `examined` is the whole validation; `headings` and `turns` (test-time rotations) are how a query is encoded,
+    `history` which weights the run began with (`chain`). `distances` holds the quantiles of the descriptor
+    distance to the right submap and to the nearest wrong one on the held-out towns, `credibility` the calibration of
+    the localizer.
     """
     distances = {
         "quantiles": QUANTILES,

@@ -19,15 +19,15 @@ from crossloc3d_ros.training.shards import ValidationTown
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 RIGHT_M = 25.0
-"""A prediction is right within this."""
-_NEAREST_COUNT = 1e-3  # pull of both logarithms towards 0: keeps them finite where one distance separates right from wrong
+"""A place is right within this."""
+_NEAREST_COUNT = 1e-3  # pull of both logarithms towards 0: keeps them finite where one distance decides everything
 
 Progress = Callable[[str, float, float, str], None]
 
 
 @dataclass(frozen=True)
 class FittedVerification:
-    """The fitted weight, and the recalls that it reaches on towns it was not fitted to."""
+    """What the fit gave, and what it is worth on towns that it did not see."""
 
     weight: float
     """Of all towns."""
@@ -45,10 +45,10 @@ class FittedVerification:
 def fit_verification(
     towns: Sequence[ValidationTown], job: EncodingJob, candidates: int, threads: int = 1
 ) -> FittedVerification:
-    """Retrieve the queries of held-out towns from all of them as `evaluate` does, and fit the weight to the predictions.
+    """Retrieve the queries of held-out towns among all of them as `evaluate` does, and fit the weight to the places.
 
-    `candidates` is how many predictions of each query are compared. Raises TrainingError where there are fewer than two
-    towns, or no query has a right and a wrong place among them; EvaluationError where the encoder has no
+    `candidates` is how many places of each query are compared. Raises TrainingError where there are fewer than two
+    towns, or no query has a right place among those found and a wrong one; EvaluationError where the encoder carries no
     calibration.
     """
     if len(towns) < 2:
@@ -83,17 +83,17 @@ def fit_verification(
 
 
 def fit_weight(distances: Float32Array, fits: Float32Array, temperature: float, right: BoolArray) -> float:
-    """Return the weight under which the right predictions are likeliest, for `evaluation.verification.scores_of`.
+    """Return the weight under which the right places are likeliest, for `evaluation.verification.scores_of`.
 
-    `distances` and `fits` (Q, N) are those of descriptors and of height maps. A prediction's odds fall by
+    `distances` and `fits` (Q, N) are those of descriptors and of height maps. A place's odds fall by
     exp(-a d / temperature - b m), as in a conditional logit; a and b are those of the greatest likelihood, the weight
     is b / a.
-    Queries without a right prediction, without a wrong one, or without any height are left out; TrainingError where no
+    Queries without a right place, or without a wrong one, or that show nothing, teach nothing; TrainingError where no
     other is left.
     """
     taught = right.any(axis=1) & ~right.all(axis=1) & np.isfinite(fits).all(axis=1)
     if not taught.any():
-        raise TrainingError("no query has a right and a wrong place among its predictions: nothing to learn from")
+        raise TrainingError("no query has a right and a wrong place among those found: nothing to learn from")
     learned, seen, hits = distances[taught] / np.float64(temperature), fits[taught].astype(np.float64), right[taught]
     unit = float(np.mean(seen.std(axis=1))) or 1.0  # so that both parameters are of the order of 1
 

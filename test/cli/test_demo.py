@@ -11,8 +11,10 @@ import pytest
 from rich.console import Console
 
 from crossloc3d_ros.cli import demo
+from crossloc3d_ros.datasets import amsterdam, amsterdam_drive
 from crossloc3d_ros.errors import MapError
 from crossloc3d_ros.evaluation.drives.estimates import EstimateTable, no_pose_lists
+from crossloc3d_ros.evaluation.drives.terminal import beside_the_truth
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import TrackState
 
@@ -20,21 +22,25 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def test_the_surveys_of_the_clone_are_found() -> None:
-    folder = demo.find_surveys(None)
-    assert (folder / demo.MAP_SURVEY).stat().st_size + (folder / demo.DRIVE_SURVEY).stat().st_size < 8_000_000
+    folder = amsterdam.find_surveys(None)
+    assert (folder / amsterdam.MAP_SURVEY).stat().st_size + (folder / amsterdam.DRIVE_SURVEY).stat().st_size < 8_000_000
 
 
 def test_missing_surveys_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(MapError, match=r"does not hold ahn2_2010\.laz and ahn3_2014\.laz"):
-        demo.find_surveys(tmp_path)
+        amsterdam.find_surveys(tmp_path)
     pytest.importorskip("rclpy")
     assert demo.main(["--surveys", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
     assert "--surveys" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
+def quiet(*_: object) -> None:
+    """Say nothing."""
+
+
 def test_what_is_current_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey, folder, target = tmp_path / "s.laz", tmp_path / "map", Console(quiet=True)
+    survey, folder = tmp_path / "s.laz", tmp_path / "map"
     survey.write_bytes(b"one")
     built: list[str] = []
 
@@ -42,39 +48,39 @@ def test_what_is_current_is_not_made_again(tmp_path: Path, monkeypatch: pytest.M
         built.append(inputs[0].read_text())
         output.mkdir(exist_ok=True)
 
-    monkeypatch.setattr(demo, "build_map", build_map)
+    monkeypatch.setattr(amsterdam_drive, "build_map", build_map)
     damaged: list[str] = []
 
     def load(folder: Path, fingerprint: str) -> None:
         if damaged:
             raise MapError(damaged.pop())
 
-    monkeypatch.setattr(demo.AerialMap, "load", load)
-    demo.make_map(survey, folder, None, "weights-1", target)
-    demo.make_map(survey, folder, None, "weights-1", target)
+    monkeypatch.setattr(amsterdam_drive.AerialMap, "load", load)
+    amsterdam_drive.make_map(survey, folder, None, "weights-1", quiet, quiet)
+    amsterdam_drive.make_map(survey, folder, None, "weights-1", quiet, quiet)
     assert built == ["one"]
-    demo.make_map(survey, folder, None, "weights-2", target)
+    amsterdam_drive.make_map(survey, folder, None, "weights-2", quiet, quiet)
     survey.write_bytes(b"two")
-    demo.make_map(survey, folder, None, "weights-2", target)
+    amsterdam_drive.make_map(survey, folder, None, "weights-2", quiet, quiet)
     assert built == ["one", "one", "two"]
     (tmp_path / "map.made-from.json").write_text("{")
-    demo.make_map(survey, folder, None, "weights-2", target)
+    amsterdam_drive.make_map(survey, folder, None, "weights-2", quiet, quiet)
     assert len(built) == 4
     damaged.append("the index is cut short")
-    demo.make_map(survey, folder, None, "weights-2", target)
+    amsterdam_drive.make_map(survey, folder, None, "weights-2", quiet, quiet)
     assert len(built) == 5
 
 
 def test_an_interrupted_build_is_not_taken_for_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey, folder, target = tmp_path / "s.laz", tmp_path / "map", Console(quiet=True)
+    survey, folder = tmp_path / "s.laz", tmp_path / "map"
     survey.write_bytes(b"one")
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo, "build_map", interrupted)
+    monkeypatch.setattr(amsterdam_drive, "build_map", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        demo.make_map(survey, folder, None, "weights", target)
+        amsterdam_drive.make_map(survey, folder, None, "weights", quiet, quiet)
     assert list(tmp_path.glob("*.made-from.json")) == []
 
 
@@ -110,7 +116,7 @@ def test_fixes_stand_beside_the_truth(tracked: bool) -> None:
         reasons=("",) * count,
     )
     said = io.StringIO()
-    Console(width=80, file=said).print(demo.beside_the_truth(table, frame))
+    Console(width=80, file=said).print(beside_the_truth(table, frame))
     lines = [line for line in said.getvalue().splitlines() if line.strip()]
     assert max(len(line) for line in lines) <= 80
     rows = [line.split() for line in lines if " s " in line]

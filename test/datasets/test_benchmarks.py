@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from crossloc3d_ros.cli.demo import DemoDrive
 from crossloc3d_ros.config import BuildConfig, PlacesConfig, PreprocessingConfig
 from crossloc3d_ros.datasets import benchmarks
 from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, built_submaps
+from crossloc3d_ros.datasets.amsterdam_drive import DemoDrive
 from crossloc3d_ros.datasets.benchmarks import open_benchmark
 from crossloc3d_ros.datasets.simulated import (
     HELD_OUT,

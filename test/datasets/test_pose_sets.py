@@ -13,7 +13,7 @@ from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.datasets import pose_sets
 from crossloc3d_ros.datasets.pose_drives import (
-    CARRIED_NS,
+    KIDNAPPED_NS,
     DrivePlan,
     Journey,
     Leg,
@@ -250,7 +250,7 @@ def test_a_carried_robot_s_clock_and_wheels_go_on() -> None:
     stamps = np.array([step.stamp_ns for step in steps])
     gaps = np.diff(stamps)
     assert (np.delete(gaps, 9) == 500_000_000).all()
-    assert CARRIED_NS <= gaps[9] <= CARRIED_NS + 1_000_000_000
+    assert KIDNAPPED_NS <= gaps[9] <= KIDNAPPED_NS + 1_000_000_000
     times = np.concatenate([step.odometry_ns for step in steps])
     assert (np.diff(times) > 0).all()
     assert np.diff(times).max() <= 100_000_000

@@ -386,3 +386,21 @@ def test_looks_are_due_at_once_then_now_and_then() -> None:
     looks.reset()
     assert looks.state is TrackState.SEARCHING
     assert looks.candidates_due(0) and looks.map_due(0)
+
+
+def test_other_settings_keep_the_hypotheses_and_what_was_read_of_the_map(
+    town: tuple[PoseSet, AerialMap, Any],
+) -> None:
+    localizer = in_town(town, scope="candidates")
+    scan = next(scan for scan in town[0].scans if town[0].on_map[scan.area])
+    before = seen(localizer, scan)
+    likelihood = localizer._aligner.likelihood  # type: ignore[union-attr]
+    config = LocalizerConfig(alignment=AlignmentConfig(scope="candidates", candidates=50), top_k=7)
+    localizer.reconfigure(config)
+    assert localizer._aligner.likelihood is likelihood  # type: ignore[union-attr]
+    again = seen(localizer, scan)
+    assert "same stamp" in again.reason, "what is known is kept, so that a scan that comes twice is one"
+    assert len(again.candidates) == 7
+    np.testing.assert_array_equal(again.grid, before.grid)
+    localizer.reconfigure(LocalizerConfig(alignment=AlignmentConfig(scope="none")))
+    assert localizer._aligner is None

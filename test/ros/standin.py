@@ -141,7 +141,8 @@ def install_tf2() -> None:
     """Put a tf2_ros in place that knows two frames and sends to a topic that a test can hear."""
     from geometry_msgs.msg import TransformStamped
 
-    known = {("map", "odom_far"): ((100.0, 50.0, 0.0), math.pi / 2), ("base_link", "velodyne"): ((0.0, 0.0, 1.2), 0.0)}
+    known = {("map", "odom_far"): ((100.0, 50.0, 0.0), math.pi / 2), ("base_link", "velodyne"): ((0.0, 0.0, 1.2), 0.0),
+             ("base_link", "elsewhere"): ((0.0, 0.0, 3.0), math.pi / 2)}  # fmt: skip
     tf2_ros: Any = types.ModuleType("tf2_ros")
 
     class TransformException(Exception):  # noqa: N818 - tf2's own name

@@ -106,7 +106,9 @@ def test_node_and_replay_give_the_same_estimates_and_no_wrong_fix(
     fixes = live.has_fix
     assert fixes.sum() >= 10, "a drive that tests something"
     np.testing.assert_allclose(live.grid[fixes, :2], replayed.grid[fixes, :2], atol=0.01)
-    np.testing.assert_allclose(live.covariance[fixes], replayed.covariance[fixes], rtol=0.01, atol=1e-4)
+    # Without the geoid's separation the topic has no altitude, and says so by its variance.
+    plane = np.ix_(fixes, [0, 1], [0, 1])
+    np.testing.assert_allclose(live.covariance[plane], replayed.covariance[plane], rtol=0.01, atol=1e-4)
     error = np.hypot(*(live.grid[fixes, :2] - truth.at(live.stamp_ns[fixes])[:, :2]).T)
     assert np.nanmax(error) < 10.0
     assert np.nanmedian(error) < 1.0

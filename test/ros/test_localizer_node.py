@@ -273,7 +273,9 @@ def test_an_initial_pose_that_tf_explains_leaves_the_mounting_of_the_lidar_alone
 
 def best_candidate(active: Robot, world: World, place: int) -> tuple[float, float, str]:
     """Return position and descriptor distance of a scan's fix."""
-    fix = active.localize(world.points(place))
+    scan = active.message(world.points(place))
+    scan.header.frame_id = "elsewhere"  # where TF has it, which is not where the settings have it
+    fix = active.localize(scan)
     _, _, values = active.diagnosis_with("last best descriptor distance", "")
     return fix.latitude, fix.longitude, values["last best descriptor distance"]
 
@@ -496,6 +498,24 @@ def test_a_setting_that_changes_keeps_an_initial_pose_and_what_is_known(active: 
     assert set_parameter(active, "fusion.max_speed_mps", double(10.0)) == (True, "")
 
 
+def test_a_setting_that_changes_while_the_node_is_inactive_holds_when_it_is_active(active: Robot, world: World) -> None:
+    active.localize(world.points(5))
+    assert active.change_state(Transition.TRANSITION_DEACTIVATE)
+    assert set_parameter(active, "scan.max_range_m", double(5.0)) == (True, "")
+    assert active.change_state(Transition.TRANSITION_ACTIVATE)
+    active.wait_for_localizer()
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_NO_FIX
+    assert set_parameter(active, "scan.max_range_m", double(100.0)) == (True, "")
+    assert active.localize(world.points(5)).status.status == NavSatStatus.STATUS_FIX
+
+
+def test_an_initial_pose_is_refused_where_no_pose_is_tracked(active: Robot) -> None:
+    assert set_parameter(active, "alignment.scope", text("none")) == (True, "")
+    active.guesses.publish(guess("map", 12.0, 15.0))
+    active.diagnosis_with("initial pose", "refused: alignment.scope is none")
+    assert set_parameter(active, "alignment.scope", text("auto")) == (True, "")
+
+
 def test_a_scan_that_does_not_end_is_an_error_and_the_state_is_stale(active: Robot, world: World) -> None:
     active.localize(world.points(5))
     slow = active.message(world.points(5))
@@ -512,7 +532,7 @@ def test_parameters_carry_description_and_range(active: Robot) -> None:
     names = ["scan.mounting.z_m", "top_k", "device"]
     request = DescribeParameters.Request(names=names)
     z, top_k, device = active.call(DescribeParameters, "/localizer/describe_parameters", request).descriptors
-    assert z.description == "above the ground under the robot"
+    assert z.description == "above the base frame, which stands on the ground"
     assert (z.floating_point_range[0].from_value, z.floating_point_range[0].to_value) == (-5.0, 20.0)
     assert (top_k.integer_range[0].from_value, top_k.integer_range[0].to_value) == (1, 1000)
     assert device.additional_constraints == "one of: cpu, cuda"

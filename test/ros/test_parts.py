@@ -127,10 +127,13 @@ def test_a_worker_that_hangs_keeps_no_more_than_it_can_use(gate: threading.Event
     worker.offer(work.on(-1))
     assert work.begun.wait(5)
     for i in range(200):
-        worker.post(work.on(i))
-    work.finish(51)
+        worker.post(work.on(i), is_sample=True)
+    worker.post(work.on(1000))
+    for i in range(200, 300):
+        worker.post(work.on(i), is_sample=True)
+    work.finish(52)
     assert worker.stop()
-    assert work.done == [-1, *range(150, 200)]
+    assert work.done == [-1, 1000, *range(250, 300)], "the newest samples, and every command"
 
 
 def test_preparation_runs_in_the_workers_thread_and_its_error_comes_back() -> None:
@@ -159,6 +162,7 @@ def test_a_worker_that_hangs_is_reported_and_never_works_beside_another(gate: th
     assert "does not end" in worker_complaint(worker.health(), 0.01)
     assert worker_complaint(worker.health(), 60.0) == ""
     assert not worker.stop(timeout_s=0.05)
+    assert not worker.stop(timeout_s=0.0), "and so whoever asks again"
     with pytest.raises(ConfigError, match="does not end: clean the node up"):
         worker.start(lambda: None)
     work.finish(1)

@@ -138,7 +138,7 @@ def test_an_initial_pose_says_what_it_does_not_know() -> None:
         (motion(0, 0, 0, 0), -np.eye(6), "variances must not be negative"),
         (motion(0, 0, 0, 0), np.full((6, 6), np.nan), "its covariance is none"),
         (motion(0, 0, 0, 0), 2.0 * np.ones((6, 6)) - np.eye(6), "correlations exceed 1"),
-        (motion(0, 0, 0, 0), np.diag(np.full(6, np.inf)), "neither place nor heading"),
+        (motion(0, 0, 0, 0), np.diag(np.full(6, np.inf)), "neither position nor heading"),
     ],
 )
 def test_an_initial_pose_that_is_none_is_refused(T: np.ndarray, covariance: np.ndarray, reason: str) -> None:
@@ -247,6 +247,14 @@ def test_a_scan_waits_for_the_odometry_of_its_stamp_but_not_for_a_silent_one(mon
     odometry.wait(add)  # and that without waiting, or this test would not end: its clock stands
 
 
+def test_odometry_without_scans_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    odometry = odometry_input()
+    fill(odometry, 500.0, step_s=0.02)
+    samples = odometry.drain()
+    assert len(samples) == 24_000
+    assert samples[-1].stamp_ns == STAMP_NS + 500_000_000_000, "the newest are kept"
+
+
 def test_odometry_in_another_frame_than_the_one_named_is_refused() -> None:
     odometry = odometry_input(odom_frame_id="odom_wheels")
     with pytest.raises(PoseError, match="given in 'odom', not in 'odom_wheels': set odom_frame_id to 'odom'"):
@@ -266,7 +274,7 @@ def test_odometry_of_another_frame_is_brought_to_the_base_where_tf_relates_them(
     def nothing(frame: str) -> np.ndarray:
         raise CloudError(f"TF has no pose of '{frame}' on 'base_link'")
 
-    for how, reason in (({}, "set base_frame_id to 'imu_link'"), ({"pose_on_base": nothing}, "TF knows no pose")):
+    for how, reason in (({}, "set base_frame_id to 'imu_link'"), ({"pose_on_base": nothing}, "TF has no pose")):
         odometry = odometry_input(**how)
         with pytest.raises((PoseError, CloudError), match=reason):
             odometry.take(odometry_message(STAMP_NS, np.eye(4), "imu_link"))

@@ -21,7 +21,7 @@ from crossloc3d_ros.localization.alignment.observation_model import CLASSES, UNK
 from crossloc3d_ros.training.alignment import (
     RIGHT_M,
     RIGHT_RAD,
-    Answer,
+    ScoredPoses,
     calibrate,
     fit_alignment,
     is_right,
@@ -29,7 +29,7 @@ from crossloc3d_ros.training.alignment import (
 )
 from crossloc3d_ros.types import AlignedPoses, no_aligned_poses, no_candidates
 
-Learned = tuple[ObservationModel, list[Answer]]
+Learned = tuple[ObservationModel, list[ScoredPoses]]
 
 
 @pytest.fixture(scope="module")
@@ -42,17 +42,17 @@ def learned(pose_set: PoseSet) -> Learned:
     return fit_alignment(pose_set)
 
 
-def drawn(share: float, temperature: float, count: int, seed: int) -> list[Answer]:
-    """Draw answers from the very model that the calibration assumes: which pose is right follows from the scores."""
-    rng, answers = np.random.default_rng(seed), []
+def drawn(share: float, temperature: float, count: int, seed: int) -> list[ScoredPoses]:
+    """Draw scored from the very model that the calibration assumes: which pose is right follows from the scores."""
+    rng, scored = np.random.default_rng(seed), []
     for _ in range(count):
         expected, log_prior = float(rng.uniform(200, 900)), -7.0
         scores = np.sort(expected * rng.uniform(0.3, 0.9, rng.integers(1, 12)))[::-1]
         log_odds = np.append((scores - share * expected) / temperature + log_prior, 0.0)
         shares = np.exp(log_odds - np.logaddexp.reduce(log_odds))
         right = int(rng.choice(len(shares), p=shares))
-        answers.append(Answer(scores, expected, right if right < len(scores) else None, log_prior))
-    return answers
+        scored.append(ScoredPoses(scores, expected, right if right < len(scores) else None, log_prior))
+    return scored
 
 
 @pytest.mark.parametrize(("share", "temperature"), [(0.5, 12.0), (0.35, 25.0)])
@@ -76,9 +76,9 @@ def test_probabilities_after_the_calibration_are_shares_of_what_is_right() -> No
 
 
 def test_answers_without_any_pose_do_no_harm() -> None:
-    answers = drawn(0.5, 12.0, 100, 4)
-    nothing = Answer(np.empty(0), 300.0, None, -7.0)
-    np.testing.assert_allclose(calibrate([*answers, nothing]), calibrate(answers), rtol=1e-3)
+    scored = drawn(0.5, 12.0, 100, 4)
+    nothing = ScoredPoses(np.empty(0), 300.0, None, -7.0)
+    np.testing.assert_allclose(calibrate([*scored, nothing]), calibrate(scored), rtol=1e-3)
 
 
 def test_a_pose_is_right_within_two_metres_and_five_degrees(pose_set: PoseSet) -> None:
@@ -99,7 +99,7 @@ def test_a_pose_is_right_within_two_metres_and_five_degrees(pose_set: PoseSet) -
 
 
 def test_what_is_learned_is_whole_and_tells_walls_from_streets(learned: Learned, tmp_path: Path) -> None:
-    model, answers = learned
+    model, scored = learned
     assert model.log_ratios.shape == (CHANNELS, CLASSES)
     assert np.isfinite(model.log_ratios).all()
     assert (model.log_ratios[:, UNKNOWN] == 0.0).all()
@@ -109,19 +109,19 @@ def test_what_is_learned_is_whole_and_tells_walls_from_streets(learned: Learned,
     assert (model.log_ratios[:LAYERS, 0] < 0.0).all(), "no returns from an empty street"
     model.save(tmp_path / "learned.safetensors")
     np.testing.assert_array_equal(ObservationModel.load(tmp_path / "learned.safetensors").log_ratios, model.log_ratios)
-    assert sum(answer.right is not None for answer in answers) >= 6
+    assert sum(answer.right is not None for answer in scored) >= 6
 
 
 def test_answers_are_scores_before_any_calibration(pose_set: PoseSet, learned: Learned) -> None:
     on_map = [bool(pose_set.on_map[scan.area]) for scan in pose_set.scans]
-    _, answers = learned
-    assert len(answers) == len(on_map)
-    for answer, on in zip(answers, on_map, strict=True):
+    _, scored = learned
+    assert len(scored) == len(on_map)
+    for answer, on in zip(scored, on_map, strict=True):
         assert on or answer.right is None, "nothing is right off the map"
         assert answer.expected > 0.0
         assert (np.diff(answer.scores) <= 1e-9).all()
         assert answer.log_prior < 0.0
-    right = [answer.scores[answer.right] / answer.expected for answer in answers if answer.right is not None]
+    right = [answer.scores[answer.right] / answer.expected for answer in scored if answer.right is not None]
     assert 0.5 < np.median(right) < 1.5, "the true pose scores what is expected of it"
 
 
@@ -137,7 +137,9 @@ def test_a_learned_model_finds_its_scans_and_doubts_the_others(pose_set: PoseSet
 
 
 def test_it_tells_how_far_it_is(pose_set: PoseSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("crossloc3d_ros.training.alignment._answer", lambda *_: Answer(np.array([9.0]), 10.0, 0, -5.0))
+    monkeypatch.setattr(
+        "crossloc3d_ros.training.alignment._scored_poses", lambda *_: ScoredPoses(np.array([9.0]), 10.0, 0, -5.0)
+    )
     reports: list[tuple[str, float, float, str]] = []
     fit_alignment(pose_set, progress=lambda *report: reports.append(report))
     assert {report[0] for report in reports} == {"learning", "aligning"}

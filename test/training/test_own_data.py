@@ -135,7 +135,7 @@ def test_with_several_headings_scans_lie_nearly_as_their_submaps(dataset: Callab
 def test_several_headings_need_scans_whose_heading_is_known(dataset: Callable[..., Path]) -> None:
     folder = dataset(headings=False)
     assert len(load_training(folder, None, CONFIG)) == SCANS
-    with pytest.raises(TrainingError, match="does not say the headings"):
+    with pytest.raises(TrainingError, match="holds no headings of its scans"):
         load_training(folder, None, dataclasses.replace(CONFIG, headings=8))
 
 
@@ -271,7 +271,7 @@ def test_without_positions_what_is_not_negative_is_ignored(dataset: Callable[...
     numbers = np.array([number_of(s) for s in batch.scans])
     same = numbers[:, None] == numbers[None]
     np.testing.assert_array_equal(batch.ignored, same & ~np.eye(SCANS + 5, dtype=bool))
-    with pytest.raises(TrainingError, match="does not say where its clouds lie"):
+    with pytest.raises(TrainingError, match="holds no positions of its clouds"):
         _ = sampler.places
 
 
@@ -282,7 +282,7 @@ def test_a_dataset_without_positions_cannot_be_held_out(dataset: Callable[..., P
     for entry in entries.values():
         del entry["northing"], entry["easting"]
     (folder / OXFORD.training).write_bytes(pickle.dumps(entries))
-    with pytest.raises(TrainingError, match="does not say where its training clouds lie"):
+    with pytest.raises(TrainingError, match="holds no positions of its training clouds"):
         load_training(folder, "oxford", CONFIG)
 
 

@@ -25,7 +25,7 @@ WORST = "wrong"
 _WIDE = 1160.0
 _LOW_M = 0.02
 _STATE_HOLDS_S = 2.0
-"""So long a state is drawn on after the scan that told it, where no other scan tells one."""
+"""A state is drawn for so long after its scan, where no other scan has one."""
 _STEPS = ("prepare", "encode", "search", "align", "fuse")
 STATE_WORDS = {
     TrackState.SEARCHING: "searching",
@@ -217,8 +217,8 @@ def belief_chart(table: EstimateTable, chosen: list[int]) -> Markup | None:
     seconds = seconds_of(table)
     chart = charts.Chart(
         _time_axis(table),
-        charts.doubt_axis("% believed"),
-        "Belief that the error is below ten metres, over time",
+        charts.doubt_axis("probability, %"),
+        "Probability of an error below ten metres, over time",
         width=_WIDE,
         height=210.0,
     )
@@ -241,11 +241,11 @@ def belief_calibration(track: TrackScores) -> Markup | None:
         charts.Axis(
             0.0,
             float(len(rows)),
-            f"believed probability of an error below {WRONG_M:g} m",
+            f"estimated probability of an error below {WRONG_M:g} m",
             [(i + 0.5, percent_range(row.low, row.high)) for i, row in enumerate(rows)],
         ),
-        charts.share_axis("was so"),
-        "Believed probability against the share that was right",
+        charts.share_axis("right"),
+        "Estimated probability against the share that was right",
         height=300.0,
     )
     marks = []

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -152,7 +151,7 @@ class EstimateTable:
     truth_heading_rad: Float64Array
     """(S,) counter-clockwise from true east; NaN where unknown."""
     states: tuple[TrackState | None, ...]
-    """(S,); None where the file does not say, and for scans that got no answer or could not be used."""
+    """(S,); None where the file does not say, and for scans that got no estimate or could not be used."""
     probability: Float64Array
     """(S,) belief that the horizontal error is below 10 m; NaN where the file does not say."""
     heading_rad: Float64Array
@@ -241,7 +240,7 @@ class EstimateWriter:
             _number(estimate.altitude_m, 3),
             *(_number(value, 3) for value in estimate.grid),
             *(_number(value, 4) for value in covariance),
-            # A scan that was dropped, or could not be used, has changed nothing: the state is not its to tell.
+            # A scan that was dropped, or could not be used, has changed nothing: the state is not its own.
             estimate.state.value if math.isfinite(estimate.probability) else "",
             _number(estimate.probability, 6),
             _number(math.degrees(heading_of(estimate.T_map_base)), 4),
@@ -318,81 +317,6 @@ def add_truth(
         writer.writerow({**row, **dict(zip(_TRUTH_COLUMNS, values, strict=True))})
     write_atomically(path, text.getvalue())
     return read_estimates(path)
-
-
-def write_geojson(path: Path, table: EstimateTable, frame: MapFrame, candidates: int = 5) -> None:
-    """Write truth, fixes and the first `candidates` of each scan as GeoJSON (RFC 7946: WGS84, longitude first)."""
-    features: list[dict[str, Any]] = []
-    truth = _geographic(frame, table.truth_grid)
-    if np.isfinite(truth).any():
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": _track(truth),
-                "properties": {"kind": "truth"},
-            }
-        )
-    errors = table.error_m
-    for i in range(len(table)):
-        place = table.geographic[i]
-        features.append(
-            {
-                "type": "Feature",
-                # RFC 7946 says null for a feature without a place.
-                "geometry": {"type": "Point", "coordinates": _position(place)}
-                if np.isfinite(place[:2]).all()
-                else None,
-                "properties": {
-                    "kind": "fix" if table.has_fix[i] else "no fix",
-                    "scan": i,
-                    "stamp_ns": str(table.stamp_ns[i]),  # as text: nanoseconds do not fit JSON's double
-                    "error_m": _json_number(errors[i], 2),
-                    "std_east_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 0, 0])), 2),
-                    "std_north_m": _json_number(math.sqrt(max(0.0, table.covariance[i, 1, 1])), 2),
-                    **_pose_properties(table, i),
-                    "reason": table.reasons[i],
-                },
-            }
-        )
-        found = table.candidate_grid[i, :candidates]
-        found = found[np.isfinite(found).all(axis=1)]
-        if len(found):
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {
-                        "type": "MultiPoint",
-                        "coordinates": [_position(p) for p in _geographic(frame, found)],
-                    },
-                    "properties": {
-                        "kind": "candidates",
-                        "scan": i,
-                        "submaps": [int(j) for j in table.candidate_ids[i, : len(found)]],
-                        "descriptor_distances": [
-                            _json_number(value, 4) for value in table.candidate_distances[i, : len(found)]
-                        ],
-                        "probabilities": [
-                            _json_number(value, 4) for value in table.candidate_probabilities[i, : len(found)]
-                        ],
-                    },
-                }
-            )
-        held = table.hypotheses.grid[i, : min(table.hypotheses.count(i), candidates)]
-        if len(held):
-            features.append(
-                {
-                    "type": "Feature",
-                    "geometry": {"type": "MultiPoint", "coordinates": [_position(p) for p in _geographic(frame, held)]},
-                    "properties": {
-                        "kind": "hypotheses",
-                        "scan": i,
-                        "probabilities": [
-                            _json_number(value, 4) for value in table.hypotheses.probabilities[i, : len(held)]
-                        ],
-                    },
-                }
-            )
-    write_atomically(path, json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False))
 
 
 def heading_of(T_map_base: Float64Array) -> float:
@@ -492,70 +416,9 @@ def _sources(rows: Sequence[dict[str, str]], width: int) -> Int64Array:
     return sources
 
 
-def _pose_properties(table: EstimateTable, scan: int) -> dict[str, Any]:
-    """Return what GeoJSON says of a pose; nothing where the file knows of places alone."""
-    state = table.states[scan]
-    if state is None:
-        return {}
-    return {
-        "state": state.value,
-        "probability": _json_number(table.probability[scan], 4),
-        "heading_deg": _json_number(math.degrees(table.heading_rad[scan]), 2),
-        "heading_std_deg": _json_number(math.degrees(table.heading_std_rad[scan]), 2),
-    }
-
-
 def _std(variance: float) -> float:
     return math.sqrt(variance) if variance >= 0.0 else math.nan
 
 
 def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
-
-
-def _json_number(value: float, digits: int) -> float | None:
-    return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _geographic(frame: MapFrame, grid: Float64Array) -> Float64Array:
-    """Return (n, 2) latitude and longitude of grid points (n, 2), NaN where these are."""
-    result = np.full((len(grid), 2), np.nan)
-    known = np.isfinite(grid).all(axis=1)
-    if known.any():
-        latitude, longitude, _ = frame.to_geographic(np.column_stack([grid[known], np.zeros(known.sum())]))
-        result[known] = np.column_stack([latitude, longitude])
-    return result
-
-
-def _position(place: Float64Array) -> list[float]:
-    position = [round(float(place[1]), 8), round(float(place[0]), 8)]
-    if len(place) > 2 and math.isfinite(place[2]):
-        position.append(round(float(place[2]), 2))
-    return position
-
-
-def _point(place: Float64Array) -> dict[str, Any] | None:
-    """Return the geometry of a place (2 or 3); null, as RFC 7946 says, where it is not known."""
-    return {"type": "Point", "coordinates": _position(place)} if np.isfinite(place[:2]).all() else None
-
-
-def _track(truth: Float64Array) -> dict[str, Any]:
-    """Return the geometry of a track (n, 2): a line for each stretch without gaps, points for what stands alone."""
-    known = np.asarray(np.isfinite(truth).all(axis=1), dtype=np.bool_)
-    pieces = np.split(np.arange(len(truth)), np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
-    stretches = [[_position(truth[i]) for i in piece] for piece in pieces if known[piece[0]]]
-    lines = [stretch for stretch in stretches if len(stretch) > 1]
-    alone = [stretch[0] for stretch in stretches if len(stretch) == 1]
-    if lines and not alone:
-        if len(lines) == 1:
-            return {"type": "LineString", "coordinates": lines[0]}
-        return {"type": "MultiLineString", "coordinates": lines}
-    if alone and not lines:
-        return {"type": "MultiPoint", "coordinates": alone}
-    return {
-        "type": "GeometryCollection",
-        "geometries": [
-            {"type": "MultiLineString", "coordinates": lines},
-            {"type": "MultiPoint", "coordinates": alone},
-        ],
-    }

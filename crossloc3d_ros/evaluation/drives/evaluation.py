@@ -17,8 +17,8 @@ from crossloc3d_ros.evaluation.drives.estimates import (
     EstimateTable,
     add_truth,
     read_estimates,
-    write_geojson,
 )
+from crossloc3d_ros.evaluation.drives.geojson import write_geojson
 from crossloc3d_ros.evaluation.drives.place_scores import Scores, score
 from crossloc3d_ros.evaluation.drives.track_scores import TrackScores, score_track
 from crossloc3d_ros.files import write_atomically
@@ -42,7 +42,7 @@ class Evaluation:
     track: TrackScores | None = None
     """None where the estimates are places and no poses, or nothing is known of the truth."""
     heading_topic: str | None = None
-    """What tells the true headings; None where nothing does."""
+    """What measures the true headings; None where nothing does."""
 
 
 def evaluate(bag: BagReader, folder: Path, aerial_map: AerialMap, gnss_topic: str | None = None) -> Evaluation:

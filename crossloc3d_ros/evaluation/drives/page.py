@@ -19,7 +19,7 @@ from crossloc3d_ros.evaluation.drives.estimates import EstimateTable
 from crossloc3d_ros.evaluation.drives.evaluation import Evaluation
 from crossloc3d_ros.evaluation.drives.page_map import MapView, grid_turn_rad, map_view, page_data
 from crossloc3d_ros.evaluation.drives.place_scores import RANKS, Scores
-from crossloc3d_ros.evaluation.drives.track_scores import CARRIED, FROM_NOTHING, LOST, WRONG_M, Search, TrackScores
+from crossloc3d_ros.evaluation.drives.track_scores import FROM_NOTHING, KIDNAPPED, LOST, WRONG_M, Search, TrackScores
 from crossloc3d_ros.evaluation.statistics import INDEPENDENT_M, RADII_M, horizontal_distances
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.geodesy import MapFrame
@@ -137,7 +137,7 @@ def drive_page(evaluation: Evaluation, aerial_map: AerialMap, about: About) -> D
         scores=evaluation.scores,
         track=track,
         start=next((search for search in searches if search.cause == FROM_NOTHING), None),
-        kidnappings=tuple(search for search in searches if search.cause == CARRIED),
+        kidnappings=tuple(search for search in searches if search.cause == KIDNAPPED),
         searches=_listed(searches),
         steps=None if track is None else measure_steps(table, aerial_map.frame),
         truth=evaluation.truth,

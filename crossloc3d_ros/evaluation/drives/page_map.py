@@ -45,14 +45,14 @@ def map_view(table: EstimateTable, backdrop: Backdrop, chosen: list[int]) -> Map
     truth = to_view(table.truth_grid[chosen], backdrop)
     places = to_view(table.grid[chosen, :2], backdrop)
     errors, classes = table.error_m[chosen], error_classes(table)
-    carried = jumped(np.hypot(*np.diff(truth, axis=0).T), np.diff(seconds_of(table)[chosen]))
+    kidnapped = jumped(np.hypot(*np.diff(truth, axis=0).T), np.diff(seconds_of(table)[chosen]))
     return MapView(
         picture_uri=backdrop.data_uri,
         width_m=width,
         height_m=height,
         pixel_m=width / 700.0,
         scale_m=max(v for v in (10, 20, 50, 100, 200, 500, 1000, 2000) if v <= max(10.0, width / 4)),
-        path=_path(np.insert(truth, np.flatnonzero(carried) + 1, np.nan, axis=0)),
+        path=_path(np.insert(truth, np.flatnonzero(kidnapped) + 1, np.nan, axis=0)),
         fixes=tuple(
             (class_of(float(error), classes), float(x), float(y))
             for (x, y), error, is_fix in zip(places, errors, table.has_fix[chosen], strict=True)

@@ -28,7 +28,7 @@ WRONG_M = 10.0
 SIGMAS = (1.0, 2.0, 3.0)
 BELIEFS = (0.0, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)
 """Borders of the ranges of belief for which it is counted how often it was right."""
-FROM_NOTHING, CARRIED, LOST = "from nothing", "carried away", "in between"
+FROM_NOTHING, KIDNAPPED, LOST = "from nothing", "kidnapped", "in between"
 _SHORT_M = 5.0
 """A gap between right fixes that is shorter than this is counted, not listed."""
 
@@ -74,7 +74,7 @@ class Search:
     seconds: float
     travelled_m: float
     cause: str
-    """`FROM_NOTHING`, `CARRIED` or `LOST`."""
+    """`FROM_NOTHING`, `KIDNAPPED` or `LOST`."""
     wrong_fixes: int
     """Fixes given meanwhile: wrong by more than `WRONG_M`."""
 
@@ -91,7 +91,7 @@ class TrackScores:
     coverage: tuple[Coverage, ...]
     beliefs: tuple[ReliabilityBin, ...]
     searches: tuple[Search, ...]
-    """The first from the start, those after the robot was carried away, and gaps of `_SHORT_M` and more."""
+    """The first from the start, those after the robot was kidnapped, and gaps of `_SHORT_M` and more."""
     short_gaps: int
     states: dict[str, int]
     """Scans in each state."""
@@ -104,12 +104,12 @@ def score_track(table: EstimateTable) -> TrackScores | None:
     known = np.isfinite(table.truth_grid).all(axis=1)
     if not table.has_track or not known.any():
         return None
-    way_m, carried = travelled(table)
+    way_m, kidnapped = travelled(table)
     states: dict[str, int] = {}
     for state in table.states:
         if state is not None:
             states[state.value] = states.get(state.value, 0) + 1
-    searches, short = find_searches(table, way_m, carried)
+    searches, short = find_searches(table, way_m, kidnapped)
     return TrackScores(
         scans=len(table),
         scored=int(known.sum()),
@@ -125,19 +125,19 @@ def score_track(table: EstimateTable) -> TrackScores | None:
 
 
 def travelled(table: EstimateTable) -> tuple[Float64Array, BoolArray]:
-    """Return the metres (S,) driven up to each scan, and at which scans (S,) the robot had been carried there.
+    """Return the metres (S,) driven up to each scan, and at which scans (S,) the robot had been kidnapped.
 
     Along the truth, straight over its gaps. What is too far for the time is no way driven.
     """
-    way, carried = np.zeros(len(table)), np.zeros(len(table), dtype=np.bool_)
+    way, kidnapped = np.zeros(len(table)), np.zeros(len(table), dtype=np.bool_)
     known = np.flatnonzero(np.isfinite(table.truth_grid).all(axis=1))
     if len(known) > 1:
         steps = np.hypot(*np.diff(table.truth_grid[known], axis=0).T)
         seconds = np.diff(table.stamp_ns[known]) / 1e9
         jumps = jumped(steps, seconds)
         way[known[1:]] = np.where(jumps, 0.0, steps)
-        carried[known[1:]] = jumps
-    return np.cumsum(way), carried
+        kidnapped[known[1:]] = jumps
+    return np.cumsum(way), kidnapped
 
 
 def is_right(table: EstimateTable) -> BoolArray:
@@ -217,7 +217,7 @@ def beliefs(table: EstimateTable, borders: Sequence[float] = BELIEFS) -> tuple[R
     return reliability(table.probability[known], right, borders, lambda inside: independent_places(truth[inside]))
 
 
-def find_searches(table: EstimateTable, way_m: Float64Array, carried: BoolArray) -> tuple[tuple[Search, ...], int]:
+def find_searches(table: EstimateTable, way_m: Float64Array, kidnapped: BoolArray) -> tuple[tuple[Search, ...], int]:
     """Return the stretches without a right fix, and how many more were shorter than `_SHORT_M` and are left out.
 
     Scans whose truth is not known neither begin nor end one.
@@ -230,16 +230,16 @@ def find_searches(table: EstimateTable, way_m: Float64Array, carried: BoolArray)
     start: int | None = None
     cause = FROM_NOTHING
     for i in np.flatnonzero(known).tolist():
-        if carried[i]:
+        if kidnapped[i]:
             if start is not None and start != i:
                 searches.append(_search(table, way_m, seconds, start, i, cause, ended=False))
-            start, cause = i, CARRIED
+            start, cause = i, KIDNAPPED
         elif start is None and not right[i]:
             start = i
             cause = LOST if searches or right[:i].any() else FROM_NOTHING
         if right[i]:
             if start is None and not searches:
-                start = i  # the very first scan was answered rightly
+                start = i  # the very first fix was right
                 cause = FROM_NOTHING
             if start is not None:
                 search = _search(table, way_m, seconds, start, i, cause, ended=True)

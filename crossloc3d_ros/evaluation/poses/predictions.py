@@ -1,4 +1,4 @@
-"""What the localizer answers to the scans and journeys of a pose set: made once, kept, scored afterwards."""
+"""What the localizer estimates for the scans and journeys of a pose set: made once, kept, scored afterwards."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ from crossloc3d_ros.workers import EncoderLoader, open_workers
 FORMAT = 1
 Odometry = Literal["wheels", "scan", "none"]
 _SESSION_ODOMETRY: dict[Odometry, OdometryKind] = {"wheels": "topic", "scan": "scan", "none": "none"}
-"""What tells how the robot moves: its wheels, its scans, nothing."""
+"""What measures how the robot moves: its wheels, its scans, nothing."""
 CANDIDATES, ALIGNED = 25, 25
 """How many of each scan's candidates and aligned poses are kept."""
 STATES = tuple(TrackState)
 SINGLE = -1
-"""The journey of a scan of the set, asked from nothing."""
+"""The journey of a scan of the set, localized from nothing."""
 _ALONE = -2
-"""Scans of journey j that were asked again from nothing are of the journey `_ALONE - j`."""
+"""Scans of journey j that were localized again from nothing are of the journey `_ALONE - j`."""
 _ALONE_EVERY = 5
 _SINGLES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
 class PoseAbout:
-    """What was asked of whom."""
+    """What was evaluated, and how."""
 
     pose_set: str
     """Name of the set."""
@@ -71,7 +71,7 @@ class PoseAbout:
     """The localizer's settings."""
     odometry: Odometry = "wheels"
     every: int = 1
-    """Each n-th scan and journey was asked."""
+    """Each n-th scan and journey was evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,9 @@ class PosePredictions:
     """One row a scan; angles are counter-clockwise from grid east, metres and radians, NaN where unknown."""
 
     journey: Int64Array
-    """(N,) number of the journey; `SINGLE` for the set's scans, asked from nothing; less: see `number_of_alone`."""
+    """(N,) number of the journey; `SINGLE` for the set's scans, localized from nothing; less: see `number_of_alone`."""
     leg: Int64Array
-    """(N,) number of the journey's leg: before each but the first the robot was carried away."""
+    """(N,) number of the journey's leg: before each but the first the robot was kidnapped."""
     area: Int64Array
     """(N,)"""
     group: Int64Array
@@ -133,7 +133,7 @@ def predict(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> PosePredictions:
-    """Ask the localizer for every single scan of a set and along every journey, in so many processes.
+    """Localize every single scan of a set and along every journey, in so many processes.
 
     `every`: for a quick look, each n-th scan and each n-th journey alone.
     """
@@ -175,12 +175,12 @@ class _Task:
 def _do(task: _Task, encoder: DescriptorEncoder, advance: Callable[[int], None] | None) -> PosePredictions:
     frame = _map_of(task.map_folder, encoder.fingerprint).frame
     localizer = _localizer_of(task.map_folder, encoder, task.config)
-    told = advance or (lambda _: None)
+    report = advance or (lambda _: None)
     if task.journey is None:
         scans = _set_of(task.folder, task.map_folder).scans
-        return predict_singles([scans[i] for i in task.singles], localizer, frame, told)
+        return predict_singles([scans[i] for i in task.singles], localizer, frame, report)
     number, journey = task.journey
-    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.odometry, told)
+    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.odometry, report)
 
 
 @functools.lru_cache(maxsize=1)
@@ -218,7 +218,7 @@ def predict_singles(
     frame: MapFrame,
     advance: Callable[[int], None] = lambda _: None,
 ) -> PosePredictions:
-    """Ask for each scan as if it were the first of all."""
+    """Localize each scan as if it were the first of all."""
     rows = []
     session = Session(localizer)
     for scan in scans:
@@ -238,7 +238,7 @@ def predict_journey(
     odometry: Odometry = "wheels",
     advance: Callable[[int], None] = lambda _: None,
 ) -> PosePredictions:
-    """Ask for each scan of a journey, with the odometry that has arrived until then."""
+    """Localize each scan of a journey, with the odometry that has arrived until then."""
     localizer.reset()
     session = Session(localizer, _SESSION_ODOMETRY[odometry])
     rows = []
@@ -249,7 +249,7 @@ def predict_journey(
         estimate = _localize(session, scan)
         rows.append(_row(scan, estimate, frame, number, step.leg, step.travelled_m))
         advance(1)
-    # Some of them again, alone: what a scan tells by itself, against what the way until there tells.
+    # Some of them again, alone: what a scan shows by itself, against what the drive until there adds.
     session = Session(localizer)
     for step in [step for step in steps_of(journey, drives) if step.leg == 0][::_ALONE_EVERY]:
         session.reset()
@@ -259,7 +259,7 @@ def predict_journey(
 
 
 def number_of_alone(predictions: PosePredictions) -> Int64Array:
-    """Return (N,) of which journey a scan is that was asked again from nothing; negative for all others."""
+    """Return (N,) of which journey a scan is that was localized again from nothing; negative for all others."""
     return _ALONE - predictions.journey
 
 
@@ -333,7 +333,7 @@ def _padded(values: Float64Array, rows: int) -> Float64Array:
 def join(parts: Sequence[PosePredictions]) -> PosePredictions:
     """Return the rows of all parts."""
     if not parts:
-        raise EvaluationError("nothing was asked: the set holds neither scans nor drives")
+        raise EvaluationError("nothing was predicted: the set holds neither scans nor drives")
     return PosePredictions(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in _columns()})
 
 
@@ -378,14 +378,14 @@ def load_predictions(path: Path) -> tuple[PosePredictions, PoseAbout]:
         with np.load(path, allow_pickle=False) as file:
             content: dict[str, Any] = json.loads(str(file["about"]))
             if content.pop("format") != FORMAT:
-                raise EvaluationError(f"{path} is of another format: ask again, without --only-score")
+                raise EvaluationError(f"{path} is of another format: predict again, without --only-score")
             tuples = {name: tuple(value) for name, value in content.items() if isinstance(value, list)}
             predictions = PosePredictions(**{name: file[name] for name in _columns()})
         lengths = {len(getattr(predictions, name)) for name in _columns()}
         if len(lengths) != 1:
-            raise EvaluationError(f"{path} is damaged: its columns differ in length; ask again, without --only-score")
+            raise EvaluationError(f"{path} is damaged: columns differ in length; predict again, without --only-score")
         return predictions, PoseAbout(**{**content, **tuples})
     except FileNotFoundError as error:
         raise EvaluationError(f"{path} does not exist: run the command without --only-score first") from error
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise EvaluationError(f"{path} is damaged ({error}); ask again, without --only-score") from error
+        raise EvaluationError(f"{path} is damaged ({error}); predict again, without --only-score") from error

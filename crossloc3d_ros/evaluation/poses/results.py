@@ -9,7 +9,8 @@ import json
 import math
 from typing import Any
 
-from crossloc3d_ros.evaluation.poses.scores import SIGMAS, Measure, PoseScores
+from crossloc3d_ros.evaluation.poses.measures import Measure
+from crossloc3d_ros.evaluation.poses.scores import SIGMAS, PoseScores
 
 _COLUMNS = (
     "set", "weights", "kind", "measure", "text", "unit", "value", "low", "high", "count", "counted", "floor",

@@ -1,4 +1,4 @@
-"""From answers to the figures of the pose benchmark: pure functions over `PosePredictions`.
+"""From predictions to the figures of the pose benchmark: pure functions over `PosePredictions`.
 
 What is counted is said at each measure. Intervals are those of `statistics`.
 """
@@ -6,12 +6,26 @@ What is counted is said at each measure. Intervals are those of `statistics`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from crossloc3d_ros.evaluation.poses.errors import (
+    AMONG_M,
+    STAGES,
+    WITHIN_DEG,
+    WITHIN_M,
+    WRONG_M,
+    best_aligned,
+    distance_m,
+    error_deg,
+    error_m,
+    is_right,
+    legs_of,
+    localized_before,
+    mahalanobis,
+)
+from crossloc3d_ros.evaluation.poses.measures import Goals, Measure, Unit, goals_of
 from crossloc3d_ros.evaluation.poses.predictions import SINGLE, PoseAbout, PosePredictions, number_of_alone, select
 from crossloc3d_ros.evaluation.statistics import (
     clustered_quantile,
@@ -20,67 +34,19 @@ from crossloc3d_ros.evaluation.statistics import (
     independent_places_in_areas,
     quantile,
     reliability,
-    squared_mahalanobis,
 )
 from crossloc3d_ros.simulation.families import HELD_OUT_FAMILIES
-from crossloc3d_ros.types import WHOLE_MAP, BoolArray, Float64Array, Int64Array
+from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array
 
-WITHIN_M, WITHIN_DEG = 2.0, 5.0
-"""A pose that is at most so far from the truth is right."""
-WRONG_M = 10.0
-"""A fix farther from the truth is wrong."""
-AMONG_M = 50.0
-"""A scan's place is among the candidates where one of their centres is so near: the submap holds the robot."""
 SIGMAS = np.linspace(0.0, 4.0, 41)
 _TWO_SIGMA = 0.9545
 _BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99, 0.999, 0.9999, 1.0)
 """Of believed probabilities; fine where it matters."""
 
-Unit = Literal["%", "m", "degrees", "fixes", "ms"]
-
-
-@dataclass(frozen=True)
-class Measure:
-    """One figure with its interval, and what was wanted of it."""
-
-    key: str
-    text: str
-    unit: Unit
-    value: float
-    """A share lies between 0 and 1; infinite: not within the drive; NaN: nothing was asked."""
-    low: float
-    high: float
-    count: int
-    """Of what it is a figure: scans, fixes, drives."""
-    counted: str
-    """Their name."""
-    floor: float | None = None
-    """Worse than this is not enough; the second number of a range is `ceiling`."""
-    goal: float | None = None
-    floor_high: float | None = None
-    goal_high: float | None = None
-    higher_is_better: bool = True
-
-    @property
-    def verdict(self) -> Literal["goal", "floor", "below", ""]:
-        """Say which of goal and floor the value reaches; empty where there is neither."""
-        if self.goal is None or math.isnan(self.value):
-            return ""
-        for name, low, high in (("goal", self.goal, self.goal_high), ("floor", self.floor, self.floor_high)):
-            if low is None:
-                continue
-            if high is not None:
-                reached = low <= self.value <= high
-            else:
-                reached = self.value >= low if self.higher_is_better else self.value <= low
-            if reached:
-                return "goal" if name == "goal" else "floor"
-        return "below"
-
 
 @dataclass(frozen=True)
 class Stage:
-    """What the answers are worth up to one stage of the chain, on the same scans."""
+    """What the poses are worth up to one stage of the chain, on the same scans."""
 
     name: str
     scans: int
@@ -123,7 +89,7 @@ class PoseScores:
     """(41,) share of the errors inside of k sigma, k in `SIGMAS`, by what they are errors of."""
     errors_m: dict[str, Float64Array]
     """Horizontal errors of the single scans by stage, and of the fixes along drives; infinite where there is no
-    answer."""
+    pose."""
 
     def measure(self, key: str) -> Measure:
         """Return one figure."""
@@ -141,112 +107,30 @@ def score_poses(predictions: PosePredictions, about: PoseAbout) -> PoseScores:
     singles = select(predictions, single & on_map)
     track = select(predictions, driven & on_map)
     away = select(predictions, (driven | single) & ~on_map)
-    asked = select(predictions, driven | single)
+    evaluated = select(predictions, driven | single)
     after = select(track, localized_before(track) & track.has_fix)
-    goals = _goals(about)
+    goals = goals_of(about)
     measures = (
         *_single_measures(singles, goals),
         *_way_measures(track, goals),
         *_after_measures(track, after, goals),
-        _wrong_measure(asked, goals),
+        _wrong_measure(evaluated, goals),
         _sigma_measure(after, goals),
         *_away_measures(away, select(away, away.journey >= 0), goals),
         *_time_measures(predictions),
     )
-    stages = {name: answer(singles) for name, answer in STAGES.items()}
-    fused = {"single, " + name: _distance(singles, answer) for name, answer in stages.items()}
+    stages = {name: pose(singles) for name, pose in STAGES.items()}
+    fused = {"single, " + name: distance_m(singles, pose) for name, pose in stages.items()}
     return PoseScores(
         about=about,
         measures=measures,
-        stages=tuple(_stage(name, singles, answer) for name, answer in stages.items()),
+        stages=tuple(_stage(name, singles, pose) for name, pose in stages.items()),
         drive_stages=_drive_stages(predictions, on_map),
         families=_family_measures(singles, about),
         calibrations=_calibrations(singles, track, away),
         inside=_inside_curves(after),
         errors_m={**fused, "drive, fixes once localized": error_m(after)},
     )
-
-
-def error_m(predictions: PosePredictions) -> Float64Array:
-    """Return the horizontal error (N,) of the localizer's pose, infinite where there is none."""
-    return _distance(predictions, predictions.pose[:, [0, 1, 3]])
-
-
-def error_deg(predictions: PosePredictions) -> Float64Array:
-    """Return the error (N,) of the localizer's heading, infinite where there is none."""
-    return _turn_deg(predictions, predictions.pose[:, [0, 1, 3]])
-
-
-def _distance(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
-    metres = np.hypot(answer[:, 0] - predictions.truth[:, 0], answer[:, 1] - predictions.truth[:, 1])
-    return np.where(np.isfinite(metres), metres, np.inf)
-
-
-def _turn_deg(predictions: PosePredictions, answer: Float64Array) -> Float64Array:
-    turn = answer[:, 2] - predictions.truth[:, 3]
-    degrees = np.degrees(np.abs(np.arctan2(np.sin(turn), np.cos(turn))))
-    return np.where(np.isfinite(degrees), degrees, np.inf)
-
-
-def is_right(predictions: PosePredictions, answer: Float64Array) -> BoolArray:
-    """Say (N,) of answers (N, 3) easting, northing, heading whether they are within 2 m and 5 degrees."""
-    near = _distance(predictions, answer) <= WITHIN_M
-    return np.asarray(near & (_turn_deg(predictions, answer) <= WITHIN_DEG), np.bool_)
-
-
-def retrieved(predictions: PosePredictions) -> Float64Array:
-    """Return the first candidate (N, 3); retrieval knows no heading."""
-    place = predictions.candidates[:, 0]
-    return np.column_stack([place, np.full(len(place), np.nan)])
-
-
-def first_aligned(predictions: PosePredictions) -> Float64Array:
-    """Return the best pose (N, 3) within 50 m of the foremost candidate that has one so near."""
-    source = predictions.aligned_source
-    own = np.isfinite(predictions.aligned[:, :, 0]) & ((source >= 0) | (source == WHOLE_MAP))
-    answer = np.full((len(predictions), 3), np.nan)
-    for place in np.moveaxis(predictions.candidates, 1, 0)[::-1]:  # the foremost last: it has the last word
-        offsets = predictions.aligned[:, :, :2] - place[:, None, :]
-        near = own & (np.hypot(offsets[:, :, 0], offsets[:, :, 1]) <= AMONG_M)
-        has = near.any(axis=1)
-        answer[has] = predictions.aligned[has, near[has].argmax(axis=1)]
-    return answer
-
-
-def best_aligned(predictions: PosePredictions) -> Float64Array:
-    """Return the pose (N, 3) that fits best of all."""
-    return predictions.aligned[:, 0]
-
-
-def whole_map_share(predictions: PosePredictions) -> float:
-    """Return the share of the scans whose best pose a search of the whole map has found."""
-    found = np.isfinite(predictions.aligned[:, 0, 0])
-    return float(np.mean(predictions.aligned_source[found, 0] == WHOLE_MAP)) if found.any() else math.nan
-
-
-STAGES: dict[str, Callable[[PosePredictions], Float64Array]] = {
-    "retrieval alone": retrieved,
-    "+ alignment": first_aligned,
-    "+ re-ranking": best_aligned,
-}
-
-
-def localized_before(track: PosePredictions) -> BoolArray:
-    """Say (N,) of the scans of journeys, in their order, whether a right fix was given in the same leg until then."""
-    right = track.has_fix & (error_m(track) <= WRONG_M)
-    known = np.zeros(len(track), np.bool_)
-    for rows in _legs(track):
-        known[rows] = np.logical_or.accumulate(right[rows])
-    return known
-
-
-def _legs(track: PosePredictions) -> list[Int64Array]:
-    """Return the rows of each leg."""
-    if not len(track):
-        return []
-    keys = np.column_stack([track.journey, track.leg])
-    number = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-    return [np.flatnonzero(number == i) for i in range(number.max() + 1)]
 
 
 def _clusters(predictions: PosePredictions) -> Int64Array:
@@ -257,57 +141,19 @@ def _places(predictions: PosePredictions) -> int:
     return independent_places_in_areas(predictions.area, predictions.truth[:, :2])
 
 
-def _share(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: _Goals) -> Measure:
+def _share(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: Goals) -> Measure:
     share = clustered_share(hit, _clusters(of), _places(of))
     return goals.measure(key, text, "%", share.value, share.low, share.high, len(hit), counted)
 
 
 def _quantile(
-    key: str, text: str, unit: Unit, values: Float64Array, of: PosePredictions, q: float, counted: str, goals: _Goals
+    key: str, text: str, unit: Unit, values: Float64Array, of: PosePredictions, q: float, counted: str, goals: Goals
 ) -> Measure:
     value, low, high = clustered_quantile(values, _clusters(of), q)
     return goals.measure(key, text, unit, value, low, high, len(values), counted)
 
 
-@dataclass(frozen=True)
-class _Goals:
-    """What is wanted of each measure: floor, goal, and the upper ends where they are ranges."""
-
-    wanted: dict[str, tuple[float | None, float, float | None, float | None, bool]]
-
-    def measure(
-        self, key: str, text: str, unit: Unit, value: float, low: float, high: float, count: int, counted: str
-    ) -> Measure:
-        if key not in self.wanted:
-            return Measure(key, text, unit, value, low, high, count, counted)
-        floor, goal, floor_high, goal_high, higher = self.wanted[key]
-        return Measure(key, text, unit, value, low, high, count, counted, floor, goal, floor_high, goal_high, higher)
-
-
-def _goals(about: PoseAbout) -> _Goals:
-    real = about.pose_set == "amsterdam"
-    at_least: dict[str, tuple[float, float]] = {"end_to_end": (0.60, 0.90) if real else (0.80, 0.97)}
-    if not real:
-        at_least["among"] = (0.95, 0.995)
-    at_most: dict[str, tuple[float | None, float]] = {
-        "until_median": (60.0, 15.0),
-        "until_95": (None, 60.0),
-        "after_median": (1.0, 0.3),
-        "after_95": (3.0, 1.0),
-        "heading_median": (1.0, 0.3),
-        "heading_95": (4.0, 1.0),
-        "wrong": (0.005, 0.0005),
-        "carried_median": (100.0, 20.0),
-        "away_fixes": (0.0, 0.0),
-    }
-    return _Goals(
-        {key: (floor, goal, None, None, True) for key, (floor, goal) in at_least.items()}
-        | {key: (floor, goal, None, None, False) for key, (floor, goal) in at_most.items()}
-        | {"inside_2_sigma": (0.90, 0.94, 0.99, 0.97, True)}
-    )
-
-
-def _single_measures(singles: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+def _single_measures(singles: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
     nearest = np.hypot(*np.moveaxis(singles.candidates - singles.truth[:, None, :2], 2, 0))
     among = select(singles, np.asarray((nearest <= AMONG_M).any(axis=1), np.bool_))
     pose = f"pose within {WITHIN_M:g} m and {WITHIN_DEG:g}°"
@@ -322,15 +168,15 @@ def _single_measures(singles: PosePredictions, goals: _Goals) -> tuple[Measure, 
     )  # fmt: skip
 
 
-def _way_measures(track: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
-    legs = _legs(track)
+def _way_measures(track: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
+    legs = legs_of(track)
     right = track.has_fix & (error_m(track) <= WRONG_M)
     measures = []
-    for key, text, carried in (
+    for key, text, kidnapped in (
         ("until", "travelled until localized, from nothing", False),
-        ("carried", "carried away while running: recovered after", True),
+        ("carried", "kidnapped while running: recovered after", True),
     ):
-        chosen = [rows for rows in legs if (track.leg[rows[0]] > 0) == carried]
+        chosen = [rows for rows in legs if (track.leg[rows[0]] > 0) == kidnapped]
         ways = np.array([track.travelled_m[rows[right[rows].argmax()]] if right[rows].any() else np.inf
                          for rows in chosen])  # fmt: skip
         first = select(track, np.array([rows[0] for rows in chosen], np.int64))
@@ -341,7 +187,7 @@ def _way_measures(track: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
     return tuple(measures)
 
 
-def _after_measures(track: PosePredictions, after: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
+def _after_measures(track: PosePredictions, after: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
     metres, degrees = error_m(after), error_deg(after)
     later = select(track, localized_before(track))
     return (
@@ -353,24 +199,19 @@ def _after_measures(track: PosePredictions, after: PosePredictions, goals: _Goal
     )
 
 
-def _wrong_measure(asked: PosePredictions, goals: _Goals) -> Measure:
-    fixes = select(asked, asked.has_fix)
+def _wrong_measure(evaluated: PosePredictions, goals: Goals) -> Measure:
+    fixes = select(evaluated, evaluated.has_fix)
     return _share("wrong", f"fixes that are wrong by more than {WRONG_M:g} m", error_m(fixes) > WRONG_M, fixes,
                   "fixes", goals)  # fmt: skip
 
 
-def mahalanobis(fixes: PosePredictions) -> Float64Array:
-    """Return the squared Mahalanobis length (N,) of the horizontal errors; infinite without a covariance."""
-    return squared_mahalanobis(fixes.pose[:, :2] - fixes.truth[:, :2], fixes.covariance[:, :2, :2])
-
-
-def _sigma_measure(after: PosePredictions, goals: _Goals) -> Measure:
+def _sigma_measure(after: PosePredictions, goals: Goals) -> Measure:
     inside = mahalanobis(after) <= -2.0 * math.log(1.0 - _TWO_SIGMA)
     return _share("inside_2_sigma", "errors inside 2 sigma (the ellipse of 95.4 %)", inside, after, "fixes", goals)
 
 
-def _away_measures(away: PosePredictions, driven: PosePredictions, goals: _Goals) -> tuple[Measure, ...]:
-    minutes = sum(np.ptp(driven.stamp_ns[rows]) for rows in _legs(driven)) / 60e9
+def _away_measures(away: PosePredictions, driven: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
+    minutes = sum(np.ptp(driven.stamp_ns[rows]) for rows in legs_of(driven)) / 60e9
     fixes = float(away.has_fix.sum()) if len(away) else math.nan
     text = f"robot outside the map ({minutes:.0f} minutes of driving, and single scans): fixes given"
     return (goals.measure("away_fixes", text, "fixes", fixes, fixes, fixes, len(away), "scans"),)
@@ -385,16 +226,16 @@ def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
     )
 
 
-def _stage(name: str, of: PosePredictions, answer: Float64Array) -> Stage:
-    metres = _distance(of, answer)
-    share = clustered_share(is_right(of, answer), _clusters(of), _places(of))
+def _stage(name: str, of: PosePredictions, pose: Float64Array) -> Stage:
+    metres = distance_m(of, pose)
+    share = clustered_share(is_right(of, pose), _clusters(of), _places(of))
     middle = float(np.median(metres)) if len(metres) else math.nan
     near, far = (float(np.mean(metres <= radius)) if len(metres) else math.nan for radius in (10.0, 50.0))
     return Stage(name, len(of), share.value, share.low, share.high, near, far, middle)
 
 
 def _drive_stages(predictions: PosePredictions, on_map: BoolArray) -> tuple[Stage, ...]:
-    """Compare scans of drives that were asked alone with what the track says at the same moment."""
+    """Compare scans of drives that were localized alone with the estimate along the drive at the same moment."""
     number = number_of_alone(predictions)
     alone = np.flatnonzero((number >= 0) & on_map)
     at = {
@@ -407,7 +248,7 @@ def _drive_stages(predictions: PosePredictions, on_map: BoolArray) -> tuple[Stag
         return ()
     lonely = select(predictions, np.array([pair[0] for pair in pairs], np.int64))
     tracked = select(predictions, np.array([pair[1] for pair in pairs], np.int64))
-    stages = [_stage(name, lonely, answer(lonely)) for name, answer in STAGES.items()]
+    stages = [_stage(name, lonely, pose(lonely)) for name, pose in STAGES.items()]
     stages.append(_stage("+ fusion, from the first scan on", tracked, tracked.pose[:, [0, 1, 3]]))
     fixed = select(tracked, tracked.has_fix)
     stages.append(_stage("+ fusion, where a fix is given", fixed, fixed.pose[:, [0, 1, 3]]))
@@ -429,7 +270,7 @@ def _family_measures(singles: PosePredictions, about: PoseAbout) -> tuple[Measur
     for name, chosen in divisions:
         of = select(singles, chosen)
         if len(of):
-            measures.append(_share(f"end_to_end/{name}", name, is_right(of, best_aligned(of)), of, "scans", _Goals({})))
+            measures.append(_share(f"end_to_end/{name}", name, is_right(of, best_aligned(of)), of, "scans", Goals({})))
     return tuple(measures)
 
 
@@ -449,7 +290,7 @@ def _calibrations(singles: PosePredictions, track: PosePredictions, away: PosePr
     lonely = select(away, away.journey == SINGLE)
     driven = select(away, away.journey >= 0)
     nothing = np.zeros(len(lonely), np.bool_)
-    near = _distance(singles, best_aligned(singles)) <= WRONG_M
+    near = distance_m(singles, best_aligned(singles)) <= WRONG_M
     return (
         calibration_of(
             "one scan: the best pose, within 10 m",
@@ -483,12 +324,3 @@ def expected_inside(name: str) -> Float64Array:
     if name == "position":
         return np.asarray(1.0 - np.exp(-0.5 * SIGMAS**2))
     return np.array([math.erf(k / math.sqrt(2.0)) for k in SIGMAS])
-
-
-def verdicts(measures: Sequence[Measure]) -> dict[str, int]:
-    """Count how many measures reach their goal, their floor alone, and neither."""
-    counts = {"goal": 0, "floor": 0, "below": 0}
-    for measure in measures:
-        if measure.verdict:
-            counts[measure.verdict] += 1
-    return counts

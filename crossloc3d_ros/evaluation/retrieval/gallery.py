@@ -1,6 +1,6 @@
-"""The paper's figure: a query beside its first five answers, seen from above, right ones framed green, wrong ones red.
+"""The paper's figure: a query beside its first five places, seen from above, right ones framed green, wrong ones red.
 
-Which queries are shown is drawn by lot with a fixed seed, half from those whose first answer is right and half from
+Which queries are shown is drawn at random with a fixed seed, half from those whose first place is right and half from
 those where it is wrong: never chosen by hand.
 """
 
@@ -37,19 +37,19 @@ class Picture:
     data_uri: str
     caption: str
     right: bool | None
-    """Whether an answer is right; None for the query itself."""
+    """Whether a retrieved place is right; None for the query itself."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A query and its first answers."""
+    """A query and the places retrieved first."""
 
     query: Picture
-    answers: tuple[Picture, ...]
+    places: tuple[Picture, ...]
 
 
 def choose(right: BoolArray, count: int) -> tuple[Int64Array, Int64Array]:
-    """Return up to `count` queries by lot from those answered right, (Q,), and up to `count` from the others."""
+    """Return up to `count` queries at random from those that are right, (Q,), and up to `count` from the others."""
     order = np.random.default_rng(_SEED).permutation(len(right))
     return order[right[order]][:count], order[~right[order]][:count]
 
@@ -58,7 +58,7 @@ def gallery(
     predictions: Predictions, evaluation_set: EvaluationSet, half_extent_m: float, *, count: int = 4,
     radius_m: float = 100.0,
 ) -> tuple[list[Row], list[Row]]:  # fmt: skip
-    """Return `count` rows whose first answer lies within the radius, and `count` where it does not.
+    """Return `count` rows whose first place lies within the radius, and `count` where it does not.
 
     `half_extent_m` is the unit of the patches. Every cloud is drawn with north up, whatever the robot's heading.
     """
@@ -70,15 +70,15 @@ def gallery(
     def row(i: int) -> Row:
         area = evaluation_set.area_names[queries.area[i]].replace("_", " ")
         picture = _picture(queries, i, float(query_north[i, 0]), half_extent_m, area, None)
-        answers = []
+        retrieved = []
         for place, apart in zip(predictions.ids[i, :TOP], metres[i, :TOP], strict=True):
             other = evaluation_set.area_names[database.area[place]].replace("_", " ")
             caption = f"{apart:,.0f} m" if math.isfinite(apart) else f"in {other}"
             if place >= len(evaluation_set.aerial):
                 caption += ", scan"
             north = float(database_north[place, 0])
-            answers.append(_picture(database, int(place), north, half_extent_m, caption, bool(apart <= radius_m)))
-        return Row(picture, tuple(answers))
+            retrieved.append(_picture(database, int(place), north, half_extent_m, caption, bool(apart <= radius_m)))
+        return Row(picture, tuple(retrieved))
 
     return [row(int(i)) for i in chosen[0]], [row(int(i)) for i in chosen[1]]
 

@@ -1,4 +1,4 @@
-"""What a method answers, before anybody looks whether it is right: nearest places of every query, in files.
+"""What a method predicts, before it is scored: the nearest places of every query, in files.
 
 The searching knows nothing of where a query was taken but for the heading mode "aligned", in which the query is turned
 to north by its true heading, as with a compass. Scoring (`scores`) is another step, from these files alone.
@@ -38,9 +38,9 @@ Way = Literal["nearest", "mean"]
 SETTINGS: tuple[Setting, ...] = ("aerial", "aerial+ground")
 HEADING_MODES: tuple[HeadingMode, ...] = ("aligned", "random")
 STORED = 100
-"""Answers kept of each query, or as many as one per cent of the database where that is more."""
+"""Places kept of each query, or as many as one per cent of the database where that is more."""
 _BLOCK = 64
-_LOT_SEED = 20_240_817
+_ANGLE_SEED = 20_240_817
 _OF_FITS = ("fits", "fit_headings_rad")
 
 
@@ -68,10 +68,10 @@ class About:
     """Median to encode one query in all its headings, in one process."""
     search_ms: float = 0.0
     verified: int = 0
-    """How many first answers of a query were ordered anew by height maps (`verification`); 0: retrieval alone."""
+    """How many first places of a query were reordered by height maps (`verification`); 0: retrieval alone."""
     verification_weight: float = 0.0
     verify_ms: float = 0.0
-    """Median to compare one query with that many answers, in one thread."""
+    """Median to compare one query with that many places, in one thread."""
 
     @property
     def name(self) -> str:
@@ -82,7 +82,7 @@ class About:
 
     @property
     def kind(self) -> str:
-        """What ordered the answers, for people."""
+        """What ordered the places, for people."""
         return "retrieval + height maps" if self.verified else "retrieval"
 
     @property
@@ -99,11 +99,11 @@ class Predictions:
     ids: Int64Array
     """(Q, K) rows of the database: the aerial places, then those of the ground database."""
     distances: Float32Array
-    """(Q, K) between descriptors; they ascend unless the answers were verified."""
+    """(Q, K) between descriptors; they ascend unless the places were verified."""
     headings: Int64Array
     """(Q, K) number of the heading, of `about.query_headings`, in which the query lay nearest."""
     fits: Float32Array | None = None
-    """(Q, K) between height maps, NaN for answers that were not verified; None where none was."""
+    """(Q, K) between height maps, NaN for places that were not verified; None where none was."""
     fit_headings_rad: Float32Array | None = None
     """(Q, K) in which heading the height maps fitted best, counter-clockwise from how the query was given."""
 
@@ -119,7 +119,7 @@ class Plan:
     invariant: bool = True
     """Whether descriptors are meant to be the same in every heading, so that their mean makes sense."""
     kept: int = STORED
-    """Answers kept of each query at least, as far as the database has them."""
+    """Places kept of each query at least, as far as the database has them."""
 
     def __post_init__(self) -> None:
         """Refuse a plan without anything to do."""
@@ -221,11 +221,11 @@ def driven_angles(queries: PlaceSet) -> Float64Array:
     """Return (Q, 1) by how much queries are turned for the heading mode "random".
 
     Nothing where a scan lies as it was driven. Queries of a data set that is aligned already (heading 0), or that does
-    not tell, are turned by angles drawn by lot, the same at every call.
+    not say, are turned by random angles, the same at every call.
     """
-    by_lot = np.random.default_rng(_LOT_SEED).uniform(0.0, 2.0 * np.pi, len(queries))
+    random_angles = np.random.default_rng(_ANGLE_SEED).uniform(0.0, 2.0 * np.pi, len(queries))
     as_driven = np.isfinite(queries.heading_rad) & (queries.heading_rad != 0.0)
-    return np.where(as_driven, 0.0, by_lot)[:, None]
+    return np.where(as_driven, 0.0, random_angles)[:, None]
 
 
 def nearest(index: DescriptorMap, queries: Float32Array, top: int) -> tuple[Int64Array, Float32Array, Int64Array]:
@@ -307,7 +307,7 @@ def load_predictions(path: Path) -> Predictions:
     return Predictions(about, ids.astype(np.int64), distances.astype(np.float32), headings.astype(np.int64), **fits)
 
 
-def check_answers(predictions: Predictions, evaluation_set: EvaluationSet) -> None:
+def check_predictions(predictions: Predictions, evaluation_set: EvaluationSet) -> None:
     """Raise EvaluationError where predictions and set do not belong together."""
     about, database = predictions.about, database_of(evaluation_set, predictions.about.setting)
     if about.data != evaluation_set.fingerprint():
@@ -321,11 +321,11 @@ def check_answers(predictions: Predictions, evaluation_set: EvaluationSet) -> No
 
 
 def metres_of(predictions: Predictions, evaluation_set: EvaluationSet) -> Float64Array:
-    """Return the horizontal distances (Q, K) in metres of each query from its answers, infinite in other areas.
+    """Return the horizontal distances (Q, K) in metres of each query from its places, infinite in other areas.
 
     Raises EvaluationError where predictions and set do not belong together.
     """
-    check_answers(predictions, evaluation_set)
+    check_predictions(predictions, evaluation_set)
     queries, database = evaluation_set.queries, database_of(evaluation_set, predictions.about.setting)
     ids = predictions.ids
     offsets = database.xy_m[ids] - queries.xy_m[:, None]

@@ -11,8 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from crossloc3d_ros.evaluation.retrieval.predictions import Way
-from crossloc3d_ros.evaluation.retrieval.scores import PUBLISHED_ONE_PER_CENT, Scores
-from crossloc3d_ros.evaluation.statistics import Recall
+from crossloc3d_ros.evaluation.retrieval.scores import Scores
 
 _COLUMNS = (
     "benchmark", "weights", "setting", "heading", "query_headings", "way", "kind", "verified", "divided_by", "name",
@@ -20,15 +19,10 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def label_of(recall: Recall) -> str:
-    """Return a recall's label for people: R@25 is what was published as AR@1%."""
-    return f"{recall.label} (“AR@1%”)" if recall.rank == PUBLISHED_ONE_PER_CENT else recall.label
-
-
 def headline(scores: Sequence[Scores], query_headings: int, way: Way) -> Scores:
     """Return the scores that stand for the method: aerial, random heading, queries tried as the localizer does it.
 
-    Where that was not asked for, aerial and aligned, or the first. Verified answers where there are any.
+    Where there is none such, aerial and aligned, or the first. Verified predictions where there are any.
     """
     verified_first = sorted(scores, key=lambda each: -each.about.verified)
     for wanted in (("aerial", "random"), ("aerial", "aligned")):

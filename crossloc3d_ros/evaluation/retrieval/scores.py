@@ -1,7 +1,7 @@
-"""From predictions to figures: pure functions of what was answered and what is true.
+"""From predictions to figures: pure functions of the predicted places and the true ones.
 
 Which queries count: as in the released evaluators, those with at least one database place within the radius; others
-cannot be answered and are left out of that radius, their number is reported.
+cannot be localized and are left out of that radius, their number is reported.
 
 Intervals are those of `statistics`.
 """
@@ -75,7 +75,7 @@ class GroupScores:
 
 @dataclass(frozen=True)
 class HeadingErrors:
-    """How well the heading in which a query was found tells the robot's, over first answers within 100 m."""
+    """How well the heading in which a query was found fits the robot's, over first places within 100 m."""
 
     queries: int
     step_deg: float
@@ -97,7 +97,7 @@ class Scores:
     areas: tuple[GroupScores, ...]
     curves: tuple[Curve, ...]
     first_m: Float64Array
-    """(Q,) metres from each query to its first answer, infinite in another area."""
+    """(Q,) metres from each query to its first place, infinite in another area."""
     heading: HeadingErrors | None = None
     """None where a query was tried in one heading alone, or none was found."""
 
@@ -153,11 +153,11 @@ def _heading_errors(predictions: Predictions, queries: PlaceSet, found: BoolArra
 
 @dataclass(frozen=True, eq=False)
 class _Truth:
-    """Which answers are right within a radius."""
+    """Which places are right within a radius."""
 
     radius_m: float
     first_hit: Int64Array
-    """(Q,) place of the first right answer from 0; beyond every rank where there is none."""
+    """(Q,) place of the first right one from 0; beyond every rank where there is none."""
     within: Int64Array
     """(Q,) places of the database within the radius."""
 
@@ -172,10 +172,10 @@ def places_within(queries: PlaceSet, database: PlaceSet, radius_m: float) -> Int
     """Count (Q,) the database's places of a query's area within the radius of it."""
     counts = np.zeros(len(queries), np.int64)
     for area in np.unique(queries.area):
-        asked, there = queries.area == area, database.area == area
+        here, there = queries.area == area, database.area == area
         if there.any():
-            found = cKDTree(database.xy_m[there]).query_ball_point(queries.xy_m[asked], radius_m, return_length=True)
-            counts[asked] = found
+            found = cKDTree(database.xy_m[there]).query_ball_point(queries.xy_m[here], radius_m, return_length=True)
+            counts[here] = found
     return counts
 
 

@@ -288,6 +288,11 @@ def _planar(T_odom_base: Float64Array) -> tuple[float, float, float] | None:
     return float(T_odom_base[0, 3]), float(T_odom_base[1, 3]), math.atan2(rotation[1, 0], rotation[0, 0])
 
 
+def require_kiss_icp() -> None:
+    """Raise ConfigError where KISS-ICP, which odometry from scan to scan needs, is not installed."""
+    _kiss_icp(100.0)
+
+
 def _kiss_icp(max_range_m: float) -> Any:
     try:
         from kiss_icp.config import load_config

@@ -48,7 +48,7 @@
   const ellipse = (x, y, [a, b, angle], attributes) => make("ellipse", { cx: 0, cy: 0, rx: a, ry: b, ...attributes,
     transform: `translate(${x} ${y}) rotate(${angle})` });
 
-  // Everything that is known of a scan, drawn with so many metres to a pixel.
+  // All marks of a scan, drawn with so many metres to a pixel.
   function marksOf(scan, px) {
     const marks = [];
     if (scan.ellipse && scan.at) marks.push(ellipse(...scan.at, scan.ellipse, { class: "ellipse", "stroke-width": 1.4 * px }));
@@ -161,16 +161,16 @@
     panel.replaceChildren(title, status, reason);
     if (data.tracked) {
       const facts = [];
-      if (scan.belief !== null) facts.push(`${percent(scan.belief)} belief in less than 10 m`);
+      if (scan.belief !== null) facts.push(`${percent(scan.belief)} probability of an error below 10 m`);
       if (scan.ellipse) facts.push(`95 % within ${metres(scan.ellipse[0])}`);
-      if (scan.turned !== null) facts.push(`heading ${degrees(Math.abs(scan.turned))} off`);
-      if (scan.headingStd !== null) facts.push(`believed to ${degrees(2 * scan.headingStd)} (2 sigma)`);
+      if (scan.turned !== null) facts.push(`heading error ${degrees(Math.abs(scan.turned))}`);
+      if (scan.headingStd !== null) facts.push(`2 sigma of the heading ${degrees(2 * scan.headingStd)}`);
       if (facts.length) panel.append(element("p", facts.join(" · "), "hint"));
     }
-    if (scan.latency !== null) panel.append(element("p", `${scan.latency.toFixed(1)} ms from scan to answer`, "hint"));
+    if (scan.latency !== null) panel.append(element("p", `${scan.latency.toFixed(1)} ms from scan to estimate`, "hint"));
     const poses = rows => rows.map((row, i) => [i + 1, percent(row[3]), metres(offBy(scan, row[0], row[1])),
       degrees(between(row[2], scan.trueHeading))]);
-    const heads = ["#", "belief", "off by", "turned by"];
+    const heads = ["#", "belief", "error", "Δ heading"];
     const source = s => s === data.exhaustive ? "map" : s < 0 ? `hypothesis ${-s}` : `square ${s + 1}`;
     if (scan.hypotheses && scan.hypotheses.length) panel.append(...fold("hypotheses", "Hypotheses", heads, poses(scan.hypotheses)));
     if (scan.aligned && scan.aligned.length) panel.append(...fold("aligned", "Aligned poses of this scan",
@@ -180,7 +180,7 @@
       c[3] === null ? "–" : (100 * c[3]).toFixed(1) + " %", metres(offBy(scan, c[0], c[1]))]);
     const hint = scan.candidates.length > data.shown || data.more
       ? `The first ${data.shown} of ${data.top} candidates; all are in estimates.csv.` : "";
-    panel.append(...fold("candidates", "Retrieved squares", ["#", "descriptor distance", "belief", "off by"], rows, hint));
+    panel.append(...fold("candidates", "Retrieved squares", ["#", "descriptor distance", "belief", "error"], rows, hint));
   }
 
   function drawCursor(scan) {

@@ -13,6 +13,7 @@ import pytest
 from crossloc3d_ros import files
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.evaluation.drives import estimates
+from crossloc3d_ros.evaluation.drives.geojson import write_geojson
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.types import (
     AlignedPoses,
@@ -264,7 +265,7 @@ def test_geojson_is_rfc_7946(tmp_path: Path, known: list[int]) -> None:
     path = write(tmp_path / "e.csv", rows)
     truth = np.array([[628_700.0 + 10 * i, 5_803_600.0] if here else [np.nan] * 2 for i, here in enumerate(known)])
     table = estimates.add_truth(path, truth, FRAME)
-    estimates.write_geojson(tmp_path / "e.geojson", table, FRAME)
+    write_geojson(tmp_path / "e.geojson", table, FRAME)
     document = json.loads((tmp_path / "e.geojson").read_text(), parse_constant=pytest.fail)  # NaN is no JSON
     assert_is_rfc_7946(document)
     kinds = [feature["properties"]["kind"] for feature in document["features"]]

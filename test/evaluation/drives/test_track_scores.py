@@ -165,7 +165,7 @@ def test_being_carried_away_is_seen_in_the_truth_and_is_no_way_driven(notices: b
     assert scores is not None
     first, carried = scores.searches
     assert (first.cause, first.end) == ("from nothing", 0)
-    assert (carried.cause, carried.start, carried.end) == ("carried away", 100, 140)
+    assert (carried.cause, carried.start, carried.end) == ("kidnapped", 100, 140)
     assert carried.travelled_m == pytest.approx(20.0)
     assert carried.wrong_fixes == (0 if notices else 40)
     assert scores.travelled_m == pytest.approx(99.0)
@@ -180,8 +180,8 @@ def test_carried_away_twice_before_it_was_found() -> None:
     assert scores is not None
     assert [(s.cause, s.start, s.end) for s in scores.searches] == [
         ("from nothing", 0, None),
-        ("carried away", 30, None),
-        ("carried away", 60, 80),
+        ("kidnapped", 30, None),
+        ("kidnapped", 60, 80),
     ]
 
 

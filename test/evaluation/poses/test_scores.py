@@ -11,6 +11,7 @@ import pytest
 
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.evaluation.poses import results as pose_results
+from crossloc3d_ros.evaluation.poses.errors import STAGES, localized_before
 from crossloc3d_ros.evaluation.poses.predictions import (
     ALIGNED,
     CANDIDATES,
@@ -23,10 +24,8 @@ from crossloc3d_ros.evaluation.poses.predictions import (
 )
 from crossloc3d_ros.evaluation.poses.scores import (
     SIGMAS,
-    STAGES,
     calibration_of,
     expected_inside,
-    localized_before,
     score_poses,
 )
 from crossloc3d_ros.types import WHOLE_MAP

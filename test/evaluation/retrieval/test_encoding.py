@@ -19,7 +19,7 @@ from crossloc3d_ros.evaluation.retrieval.encoding import (
     north_angles,
     time_queries,
 )
-from crossloc3d_ros.evaluation.retrieval.scan_context import ScanContext
+from crossloc3d_ros.training.handcrafted import ScanContext
 
 
 class Counting:

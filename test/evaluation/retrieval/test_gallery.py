@@ -71,8 +71,8 @@ def test_frames_and_captions_say_what_is_right() -> None:
     (row,), wrong = gallery(made, towns, 50.0)
     assert wrong == []
     assert row.query.right is None
-    assert [answer.right for answer in row.answers] == [True, False, False, True]
-    assert [answer.caption for answer in row.answers] == ["50 m", "400 m", "in new town 2", "8 m, scan"]
+    assert [answer.right for answer in row.places] == [True, False, False, True]
+    assert [answer.caption for answer in row.places] == ["50 m", "400 m", "in new town 2", "8 m, scan"]
     # Scans are drawn north up by their true heading, so the corner lies where the submaps have it.
-    for picture in (row.query, *row.answers):
+    for picture in (row.query, *row.places):
         np.testing.assert_allclose(lit(decoded(picture)), lit(top_view(CORNER, 50.0)), atol=0.02)

@@ -55,7 +55,7 @@ class Oracle:
 
 
 class Lot(Oracle):
-    """Draws descriptors by lot."""
+    """Draws random descriptors."""
 
     fingerprint = "lot"
 
@@ -130,7 +130,7 @@ def test_an_encoder_that_knows_the_place_is_always_right(tmp_path: Path) -> None
         assert (np.diff(made.distances, axis=1) >= 0).all()
 
 
-def test_an_encoder_that_draws_by_lot_reaches_what_chance_says(tmp_path: Path) -> None:
+def test_an_encoder_that_draws_at_random_reaches_the_chance_level(tmp_path: Path) -> None:
     towns = town_set(towns=12, queries=1500)
     (made,) = predict(towns, Lot(), tmp_path, Plan(settings=("aerial",), headings=("aligned",))).values()
     scores = score(made, towns)

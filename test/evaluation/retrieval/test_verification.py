@@ -227,7 +227,7 @@ def test_what_does_not_belong_together_is_refused(towns: EvaluationSet) -> None:
         verify(changed(data="0123456789abcdef"), towns, Calibrated(), CONFIG)
     with pytest.raises(EvaluationError, match="name scans as places"):
         verify(changed(setting="aerial+ground"), towns, Calibrated(), CONFIG)
-    with pytest.raises(EvaluationError, match="hold 24 answers a query, 30 are to be"):
+    with pytest.raises(EvaluationError, match="hold 24 places a query, 30 are to be"):
         verify(before, towns, Calibrated(), dataclasses.replace(CONFIG, candidates=300))
     with pytest.raises(EvaluationError, match="does not have"):
         verify(dataclasses.replace(before, ids=before.ids + PLACES), towns, Calibrated(), CONFIG)

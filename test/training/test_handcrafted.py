@@ -10,7 +10,7 @@ import pytest
 from crossloc3d_ros.config import HeightMapConfig, PreprocessingConfig
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.evaluation.retrieval.encoding import OwnDistance
-from crossloc3d_ros.evaluation.retrieval.scan_context import HeightMaps, ScanContext
+from crossloc3d_ros.training.handcrafted import HeightMaps, ScanContext
 from crossloc3d_ros.types import DescriptorEncoder, Float32Array
 
 

@@ -1,0 +1,1 @@
+"""Modes of commands that are worth a module of their own."""
