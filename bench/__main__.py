@@ -201,7 +201,11 @@ def bench_node(output: Path, aerial_map: AerialMap, weights: Path | None) -> lis
         Figure("node: message to fix, median", float(np.median(known)), "ms", "100"),
         Figure("node: message to fix, 95 %", float(np.percentile(known, 95)), "ms"),
         Figure(
-            "node: scans without an answer", float(live.scans - live.answers), "scans", "0", note=f"of {live.scans:,}"
+            "node: scans without an estimate",
+            float(live.scans - live.estimates),
+            "scans",
+            "0",
+            note=f"of {live.scans:,}",
         ),
     ]
 

@@ -66,7 +66,7 @@ class Candidates:
     descriptor_distances: Float32Array
     """(k,) Euclidean, in descriptor units."""
     probabilities: Float64Array
-    """(k,) share of belief that each candidate is the place; at most 1 in all."""
+    """(k,) probability that each candidate is the place; at most 1 in all."""
     grid: Float64Array
     """(k, 3) easting, northing, ground height, metres, grid frame."""
     heading_rad: Float64Array = field(default_factory=lambda: np.empty(0))

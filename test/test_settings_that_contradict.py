@@ -36,7 +36,7 @@ def test_a_device_that_is_none_is_refused() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_a_gpu_that_is_not_there_is_said() -> None:
+def test_a_gpu_that_is_not_there_is_reported() -> None:
     with pytest.raises(ConfigError, match="sees no GPU"):
         load_encoder(device="cuda")
 

@@ -94,7 +94,7 @@ def _demo(arguments: argparse.Namespace) -> None:
             progress=lambda done, total, newest: display("play", done, total, f"scans; {_in_brief(newest)}"),
         )
     target.print(
-        f"{live.answers:,} estimates for {live.scans:,} scans; the player was late by "
+        f"{live.estimates:,} estimates for {live.scans:,} scans; the player was late by "
         f"{live.play.late_median_ms:.1f} ms in the median, {live.play.late_p99_ms:.1f} ms at 99 %"
     )
 
@@ -106,7 +106,7 @@ def _demo(arguments: argparse.Namespace) -> None:
         results.print(table)
 
     _headline(target, 5, "the page")
-    write_results(output, evaluation, aerial_map, _about(arguments, encoder, live.scans, live.answers))
+    write_results(output, evaluation, aerial_map, _about(arguments, encoder, live.scans, live.estimates))
     print(f"{output / PAGE}   (open it in a browser)")
     target.print(f"done in {time.monotonic() - begun:.0f} s")
 

@@ -133,7 +133,7 @@ def kernel_map(coords: Any, starts: Any, queries: Any, query_starts: Any, kernel
     """Find for every output site its input neighbours.
 
     coords (N, 3) and queries (M, 3) int32 hold x, y, z of the input and output sites, cloud by cloud as `starts` and
-    `query_starts` (B + 1,) say, each cloud's sorted by z, then y, then x. Kernel index k = ix + K iy + K^2 iz, offset
+    `query_starts` (B + 1,) begin, each cloud's sorted by z, then y, then x. Kernel index k = ix + K iy + K^2 iz, offset
     (ix - K // 2, ...) times `step`.
     Returns in_rows (P,), out_rows (P,) int32, sorted by kernel and then by output row, and first (K^3 + 1,) int64,
     where each kernel's pairs begin.

@@ -1,4 +1,4 @@
-"""The real localizer node as a process of its own, a recording played into it over DDS, and what it answers."""
+"""The real localizer node as a process of its own: a recording is played into it over DDS, its estimates are kept."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ log = logging.getLogger(__name__)
 NODE_NAME = "localizer"
 PROGRAM = ("-m", "crossloc3d_ros.cli.localizer")
 _QUIET_S = 3.0
-"""The node has answered everything that it will when so long nothing has come."""
+"""After so long without a message no further estimate is expected."""
 _STOP_S = 15.0
 
 
-class Answer(NamedTuple):
-    """What the node said to one scan."""
+class ReceivedFix(NamedTuple):
+    """The fix of one scan."""
 
     fix: NavSatFix
     arrived_ns: int
@@ -71,22 +71,23 @@ class LiveReport:
 
     play: PlayReport
     scans: int
-    answers: int
+    estimates: int
+    """Scans whose estimate was received."""
     startup_s: float
     """From starting the process to its subscription: loading, compiling, warming up."""
 
 
 class Recorder:
-    """Collect a localizer's answers by the stamp of the scan that they answer; the callbacks run in another thread."""
+    """Collect a localizer's outputs by the stamp of their scan; the callbacks run in another thread."""
 
     def __init__(self, node: Node, localizer: str = NODE_NAME) -> None:
         """Subscribe to the outputs of the node `localizer`."""
-        self.answers: dict[int, Answer] = {}
+        self.fixes: dict[int, ReceivedFix] = {}
         self.poses: dict[int, PoseWithCovarianceStamped] = {}
         self.tables: dict[int, PointCloud2] = {}
         self.hypotheses: dict[int, PoseArray] = {}
         self.states: dict[int, DiagnosticStatus] = {}
-        self.heard_at = time.monotonic()
+        self.received_at = time.monotonic()
         node.create_subscription(NavSatFix, f"/{localizer}/fix", self._on_fix, 100)
         for kind, topic, kept in (
             (PoseWithCovarianceStamped, "pose", self.poses),
@@ -98,13 +99,13 @@ class Recorder:
 
     def _on_fix(self, message: NavSatFix) -> None:
         arrived_ns = time.monotonic_ns()
-        self.answers[_stamp_ns(message)] = Answer(message, arrived_ns)
-        self.heard_at = time.monotonic()
+        self.fixes[_stamp_ns(message)] = ReceivedFix(message, arrived_ns)
+        self.received_at = time.monotonic()
 
     def _keeper(self, kept: dict[int, Any]) -> Callable[[Any], None]:
         def keep(message: Any) -> None:
             kept[_stamp_ns(message)] = message
-            self.heard_at = time.monotonic()
+            self.received_at = time.monotonic()
 
         return keep
 
@@ -114,11 +115,11 @@ class Recorder:
             self.states[int(stamp)] = message
 
     def estimate(self, stamp_ns: int, frame: MapFrame) -> Estimate:
-        """Return what the node said to the scan of that stamp."""
-        answer = self.answers.get(stamp_ns)
-        if answer is None:
-            return no_estimate(stamp_ns, "the node gave no answer: the scan was dropped or lost")
-        fix = answer.fix
+        """Return the node's estimate of the scan of that stamp."""
+        received = self.fixes.get(stamp_ns)
+        if received is None:
+            return no_estimate(stamp_ns, "the node published no estimate: the scan was dropped or lost")
+        fix = received.fix
         is_fix = fix.status.status >= NavSatStatus.STATUS_FIX
         state, reason, probability = _state(self.states.get(stamp_ns))
         table = self.tables.get(stamp_ns)
@@ -149,6 +150,14 @@ class Recorder:
         covariance = np.array(pose.pose.covariance, dtype=np.float64).reshape(6, 6)
         return replace(known, enu=T_map_base[:3, 3], T_map_base=T_map_base, pose_covariance=covariance)
 
+    def write(self, path: Path, published: Mapping[int, int], frame: MapFrame) -> None:
+        """Write the estimates of the scans {stamp: when published, ns} and their latencies to a CSV file."""
+        with EstimateWriter(path) as writer:
+            for stamp_ns, published_ns in sorted(published.items()):
+                received = self.fixes.get(stamp_ns)
+                latency_ms = float("nan") if received is None else (received.arrived_ns - published_ns) / 1e6
+                writer.write(self.estimate(stamp_ns, frame), latency_ms)
+
 
 def localize_live(
     bag: BagReader,
@@ -166,12 +175,12 @@ def localize_live(
     on_started: Callable[[float], None] = lambda _: None,
     progress: Callable[[int, int, Estimate | None], None] = lambda done, total, newest: None,
 ) -> LiveReport:
-    """Start the localizer, play the bag into it, write its answers to the CSV file `output`.
+    """Start the localizer, play the bag into it, write its estimates to the CSV file `output`.
 
     `topic` holds the clouds, `odometry_topic` the odometry, by default what `odom` is; `frame` is the map's;
     `parameters` are the node's, besides `map`; `program` is what Python runs; what the node logs goes to `log_path`.
     A DDS domain of its own, confined to this machine, keeps other nodes out. `on_started` is called with the seconds
-    that the start took, `progress` with scans played, scans in all and the newest answer. Raises CrossLocError, with
+    that the start took, `progress` with scans played, scans in all and the newest estimate. Raises CrossLocError, with
     the end of the node's log, if it does not come up.
     """
     domain = 1 + os.getpid() % 100 if domain is None else domain
@@ -192,19 +201,15 @@ def localize_live(
             if message.topic == topic:
                 published[header_stamp_ns(message.cdr)] = published_ns
                 process.check()
-                newest = max(recorder.answers, default=None)
+                newest = max(recorder.fixes, default=None)
                 progress(len(published), total, None if newest is None else recorder.estimate(newest, frame))
 
         play = player.play(on_published)
-        while len(recorder.answers) < len(published) and time.monotonic() - recorder.heard_at < _QUIET_S:
+        while len(recorder.fixes) < len(published) and time.monotonic() - recorder.received_at < _QUIET_S:
             time.sleep(0.05)
         time.sleep(0.2)  # the table of the last scan comes after its fix
-    with EstimateWriter(output) as writer:
-        for stamp_ns, published_ns in sorted(published.items()):
-            answer = recorder.answers.get(stamp_ns)
-            latency_ms = float("nan") if answer is None else (answer.arrived_ns - published_ns) / 1e6
-            writer.write(recorder.estimate(stamp_ns, frame), latency_ms)
-    return LiveReport(play, len(published), len(set(published) & set(recorder.answers)), took_s)
+    recorder.write(output, published, frame)
+    return LiveReport(play, len(published), len(set(published) & set(recorder.fixes)), took_s)
 
 
 def header_stamp_ns(cdr: bytes) -> int:
@@ -229,10 +234,10 @@ class _Process:
         """Raise CrossLocError if the node has ended."""
         code = self._child.poll()
         if code is not None:
-            raise CrossLocError(f"the localizer ended with code {code}: {self._last_words()}")
+            raise CrossLocError(f"the localizer ended with code {code}: {self._end_of_log()}")
 
     def stop(self) -> None:
-        """End the node as Ctrl-C would, by force if it does not listen."""
+        """End the node as Ctrl-C would, by force if it does not end."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if self._child.poll() is not None:
                 break
@@ -242,11 +247,11 @@ class _Process:
         if not isinstance(self._log, int):
             self._log.close()
 
-    def _last_words(self) -> str:
+    def _end_of_log(self) -> str:
         if self._log_path is None:
             return "no log was kept"
         lines = self._log_path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return f"{' | '.join(lines[-3:]) or 'it said nothing'} (all of it in {self._log_path})"
+        return f"{' | '.join(lines[-3:]) or 'its log is empty'} (all of it in {self._log_path})"
 
 
 def _command(
@@ -269,7 +274,7 @@ def _localizer_process(command: Sequence[str], log_path: Path | None) -> Iterato
 
 @contextmanager
 def _node(domain: int) -> Iterator[tuple[Node, Recorder]]:
-    """Give a node whose callbacks run in a thread, and the recorder in it."""
+    """Yield a node whose callbacks run in a thread, and the recorder in it."""
     prepare_for_large_clouds()
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
@@ -354,7 +359,7 @@ def _candidates(table: PointCloud2 | None, frame: MapFrame) -> Candidates:
 
 
 def _aligned(table: PointCloud2 | None, frame: MapFrame) -> AlignedPoses:
-    """Return the aligned poses that the table of candidates holds, likeliest first; what it does not tell is NaN."""
+    """Return the aligned poses that the table of candidates holds, likeliest first; what it does not hold is NaN."""
     rows = _rows(table)
     sources = np.flatnonzero(np.isfinite(rows["aligned_yaw"]))
     if len(sources) == 0:
@@ -378,7 +383,7 @@ def _aligned(table: PointCloud2 | None, frame: MapFrame) -> AlignedPoses:
 
 
 def _hypotheses(message: PoseArray | None, state: DiagnosticStatus | None, frame: MapFrame) -> Hypotheses:
-    """Return the hypotheses; what the messages do not tell of them is NaN."""
+    """Return the hypotheses; what the messages do not hold is NaN."""
     if message is None or state is None or not message.poses:
         return no_hypotheses()
     probabilities = np.array(_values(state)["hypotheses"].split(), dtype=np.float64)

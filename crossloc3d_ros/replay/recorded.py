@@ -41,7 +41,7 @@ class Ended:
     """How the localizing of a recording ended."""
 
     broken: BagError | None = None
-    """What was read before the damage is worth its figures."""
+    """What was read before the damage is evaluated."""
     interrupted: bool = False
 
     @property

@@ -178,7 +178,7 @@ def candidates_message(estimate: Estimate, frame: MapFrame, global_frame_id: str
 def candidate_table_message(estimate: Estimate, frame: MapFrame, global_frame_id: str) -> PointCloud2:
     """Return the candidates, best first, with all that is known of each.
 
-    `aligned_*` is the pose at which the scan fits best around the candidate, in the map frame, and the share of belief
+    `aligned_*` is the pose at which the scan fits best around the candidate, in the map frame, and its probability
     from this scan alone; NaN where it fits nowhere.
     """
     candidates = estimate.candidates

@@ -286,7 +286,7 @@ class LocalizerNode(LifecycleNode):
 
         def prepare() -> None:
             # In the worker's own thread, because numerical libraries keep state for each thread.
-            parts.localizing.reconfigure(config)  # what has changed while nobody worked
+            parts.localizing.reconfigure(config)  # what has changed while no scan was processed
             parts.localizer.warm_up()
             parts.localizing.reset()
 
@@ -318,7 +318,7 @@ class LocalizerNode(LifecycleNode):
     # Parameters and the service
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set the parameters, all or none; a refusal says which one and why."""
+        """Set the parameters, all or none; a refusal names the parameter and the reason."""
         try:
             admitted = self._configuration.admit(parameter_list)
         except ConfigError as error:
@@ -403,7 +403,7 @@ class LocalizerNode(LifecycleNode):
         return (Statistics() if self._parts is None else self._parts.statistics).snapshot()
 
     def _report_stale(self, reason: str) -> None:
-        """Say once, after the last scan, that the latched state is no longer current."""
+        """Report once, after the last scan, that the latched state is no longer current."""
         snapshot = self._snapshot()
         if self._parts is None or self._stale_after == snapshot.processed:
             return

@@ -48,7 +48,7 @@ def change(points: Float32Array, half_extent_m: float, rng: np.random.Generator,
     """Return the points (n, 3) of a place, in metres, as another day and another sensor would have them.
 
     Fewer of them, each a little displaced, some things gone and others come: what a survey years old, flown with
-    another density, never shares with a scan of today. `config` says how much of each.
+    another density, never shares with a scan of today. `config` sets how much of each.
     """
     kept = rng.random(len(points)) < rng.uniform(config.keep_survey, 1.0)
     for _ in range(rng.poisson(config.changes)):

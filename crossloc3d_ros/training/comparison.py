@@ -223,7 +223,7 @@ class Comparison:
     budget: Budget
     evaluation_set: EvaluationSet
     preprocessing: PreprocessingConfig
-    """Of the set's patches: for the methods that carry none of their own."""
+    """Of the set's patches: for the methods that have none of their own."""
     cache: Path
     """Folder in which descriptors are kept."""
     workers: int = 1

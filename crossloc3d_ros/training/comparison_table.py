@@ -18,7 +18,7 @@ CSV, MARKDOWN, HTML = "comparison.csv", "comparison.md", "comparison.html"
 
 @dataclass(frozen=True)
 class TableTexts:
-    """What is said above a table."""
+    """Title and facts above a table."""
 
     title: str
     facts: tuple[str, ...]

@@ -35,7 +35,7 @@ class Validation:
 
 @dataclass(frozen=True)
 class CurvePage:
-    """What the template of the page knows."""
+    """Return the values of the page's template."""
 
     run: str
     reload_s: int | None

@@ -1,10 +1,10 @@
 """Place recognition without learning: methods that stand in for an encoder and bring their own distance.
 
 `ScanContext` is the published method (IROS 2018): greatest heights in rings x sectors, the mean over the sectors of one
-minus the cosine of two columns, the least over all turns. It takes both clouds for scans of one sensor. Every place is
+minus the cosine of two columns, the least over all shifts. It takes both clouds for scans of one sensor. Every place is
 compared in every heading; there is no preselection by ring keys to lose a place in.
 
-`HeightMaps` is the same idea made for a scan that looks for itself in a survey; see `clouds.height_map`.
+`HeightMaps` is the same idea made for retrieving a scan from a survey; see `clouds.height_map`.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class ScanContext(_Method):
         return self.compare(queries, database)[0]
 
     def compare(self, queries: Float32Array, database: Float32Array) -> tuple[Float32Array, Float64Array]:
-        """Return distances and headings (Q, M): radians by which the query must be turned counter-clockwise."""
+        """Return distances and headings (Q, M): radians, counter-clockwise, from query to submap."""
         spectra = self._prepared(database)
         best = np.empty((len(queries), len(database)), np.float32)
         shifts = np.empty(best.shape, np.int64)

@@ -1,6 +1,6 @@
 """Places to learn from in a real survey: a simulated sensor driven through the surface that the survey shows.
 
-Weights that learned in simulated towns can so be taught the town that they are to be used in, before any robot was
+Weights trained in simulated towns can so be trained on for the town that they are to be used in, before any robot was
 there: all that is needed is the survey of which the map is made.
 """
 

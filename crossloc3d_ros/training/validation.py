@@ -41,7 +41,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Validation:
-    """One look at the held-out towns: aerial database, ground queries, headings over the full circle."""
+    """One evaluation on the held-out towns: aerial database, ground queries, headings over the full circle."""
 
     queries: int
     submaps: int
@@ -116,7 +116,7 @@ def score(descriptor_distances: Float64Array, metres: Float64Array) -> Validatio
 
 
 def fit_calibration(descriptor_distances: Float64Array, metres: Float64Array) -> CalibrationConfig:
-    """Fit what the localizer believes to the same matrices.
+    """Fit the localizer's calibration to the same matrices.
 
     Every query counts twice: against the whole database, and against the database without its own town. The second
     is a robot outside of the map, for which low beliefs must be learned.
@@ -135,19 +135,19 @@ def validate(
     towns: Sequence[ValidationTown],
     encode: Callable[[list[Float32Array]], Float32Array],
     headings: int = 1,
-    turns: int = 1,
+    rotations: int = 1,
 ) -> Validation:
     """Encode all queries and submaps of the held-out towns into one database and score the retrieval.
 
-    `encode` turns patches (n, 3) into descriptors (B, D). With `headings` H > 1 every query, whatever its heading, is
-    encoded H times, turned by 2 pi h / H, and its distance to a submap is the least of the H. With `turns` T > 1 and
-    one heading its descriptor is the mean of those of T turns.
+    `encode` maps patches (n, 3) to descriptors (B, D). With `headings` H > 1 every query, whatever its heading, is
+    encoded H times, rotated by 2 pi h / H, and its distance to a submap is the least of the H. With `rotations` T > 1
+    and one heading its descriptor is the mean over T test-time rotations.
     """
     query_places = Places(_towns([len(t.query_xy_m) for t in towns]), np.concatenate([t.query_xy_m for t in towns]))
     submap_places = Places(_towns([len(t.submap_xy_m) for t in towns]), np.concatenate([t.submap_xy_m for t in towns]))
     patches = [patch for town in towns for patch in town.query_patches]
     submaps = encode([patch for town in towns for patch in town.submap_patches])
-    angles = heading_angles(max(headings, turns))
+    angles = heading_angles(max(headings, rotations))
     encoded = [encode([rotate_about_z(patch, float(angle)) for patch in patches]) for angle in angles]
     queries = encoded if headings > 1 else [np.mean(encoded, axis=0)]
     nearest = np.min([euclidean_distances(q, submaps) for q in queries], axis=0)

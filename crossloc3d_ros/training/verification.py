@@ -27,7 +27,7 @@ Progress = Callable[[str, float, float, str], None]
 
 @dataclass(frozen=True)
 class FittedVerification:
-    """What the fit gave, and what it is worth on towns that it did not see."""
+    """The fitted weight, and the recalls that it reaches on towns it was not fitted to."""
 
     weight: float
     """Of all towns."""
@@ -48,7 +48,7 @@ def fit_verification(
     """Retrieve the queries of held-out towns among all of them as `evaluate` does, and fit the weight to the places.
 
     `candidates` is how many places of each query are compared. Raises TrainingError where there are fewer than two
-    towns, or no query has a right place among those found and a wrong one; EvaluationError where the encoder carries no
+    towns, or no query has a right place among those found and a wrong one; EvaluationError where the encoder has no
     calibration.
     """
     if len(towns) < 2:
@@ -88,18 +88,18 @@ def fit_weight(distances: Float32Array, fits: Float32Array, temperature: float, 
     `distances` and `fits` (Q, N) are those of descriptors and of height maps. A place's odds fall by
     exp(-a d / temperature - b m), as in a conditional logit; a and b are those of the greatest likelihood, the weight
     is b / a.
-    Queries without a right place, or without a wrong one, or that show nothing, teach nothing; TrainingError where no
+    Queries without a right place, or without a wrong one, or without any height, are left out; TrainingError where no
     other is left.
     """
-    taught = right.any(axis=1) & ~right.all(axis=1) & np.isfinite(fits).all(axis=1)
-    if not taught.any():
+    usable = right.any(axis=1) & ~right.all(axis=1) & np.isfinite(fits).all(axis=1)
+    if not usable.any():
         raise TrainingError("no query has a right and a wrong place among those found: nothing to learn from")
-    learned, seen, hits = distances[taught] / np.float64(temperature), fits[taught].astype(np.float64), right[taught]
+    learned, seen, hits = distances[usable] / np.float64(temperature), fits[usable].astype(np.float64), right[usable]
     unit = float(np.mean(seen.std(axis=1))) or 1.0  # so that both parameters are of the order of 1
 
     def loss(x: Float64Array) -> float:
-        belief = -np.exp(x[0]) * learned - np.exp(x[1]) / unit * seen
-        losses = logsumexp(belief, axis=1) - logsumexp(np.where(hits, belief, -np.inf), axis=1)
+        score = -np.exp(x[0]) * learned - np.exp(x[1]) / unit * seen
+        losses = logsumexp(score, axis=1) - logsumexp(np.where(hits, score, -np.inf), axis=1)
         return float(losses.mean() + _NEAREST_COUNT * (x**2).sum())
 
     best = minimize(loss, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-9}).x

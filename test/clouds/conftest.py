@@ -35,7 +35,7 @@ def cast_vlp16(
     noise_m: float = 0.02,
     tilt: Array | None = None,
 ) -> Cast:
-    """Cast 16 rings from 1.2 m above the terrain at the origin; `tilt` (3, 3) turns the sensor, not the result."""
+    """Cast 16 rings from 1.2 m above the terrain at the origin; `tilt` (3, 3) rotates the sensor, not the result."""
     azimuth = np.linspace(0, 2 * np.pi, columns, endpoint=False)
     elevation = np.radians(np.arange(-15, 16, 2))
     a, e = (v.ravel() for v in np.meshgrid(azimuth, elevation, indexing="ij"))

@@ -41,14 +41,14 @@ def test_there_and_back_is_the_identity_and_keeps_the_type(dtype: type) -> None:
 
 @given(st.floats(-60, 60), st.floats(-60, 60), st.floats(0.01, 20))
 @settings(max_examples=50, deadline=None)
-def test_levelling_turns_up_to_z_whatever_its_length(roll: float, pitch: float, length: float) -> None:
+def test_levelling_rotates_up_to_z_whatever_its_length(roll: float, pitch: float, length: float) -> None:
     up = Rotation.from_euler("xy", [roll, pitch], degrees=True).apply([0, 0, 1.0])
     if up[2] < 0.21:
         return
     T = levelling_matrix(up * length)
     np.testing.assert_allclose(T[:3, :3] @ up, [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
-    # The smallest such rotation: its axis is level, so nothing is turned about z.
+    # The smallest such rotation: its axis is level, so nothing is rotated about z.
     assert Rotation.from_matrix(T[:3, :3]).as_rotvec()[2] == pytest.approx(0, abs=1e-9)
 
 

@@ -136,7 +136,7 @@ def test_car_roofs_and_walls_are_not_ground(scans: dict[str, Any]) -> None:
 
 
 def test_a_roof_beside_a_high_sensor_is_not_ground() -> None:
-    """A sensor at 2.4 m looks down on the roofs of the cars around it: flat, dense and 1.5 m up."""
+    """A sensor at 2.4 m sees from above the roofs of the cars around it: flat, dense and 1.5 m up."""
     rng = np.random.default_rng(0)
     road = np.column_stack([rng.uniform(-40, 40, 4000), rng.uniform(-2, 2, 4000), rng.normal(0, 0.02, 4000)])
     roofs = np.vstack(
@@ -149,10 +149,10 @@ def test_a_roof_beside_a_high_sensor_is_not_ground() -> None:
 
 
 @pytest.mark.parametrize("turn_deg", [31.0, 90.0, 200.0])
-def test_turning_on_the_spot_changes_the_heights_little(scans: dict[str, Any], turn_deg: float) -> None:
+def test_rotating_on_the_spot_changes_the_heights_little(scans: dict[str, Any], turn_deg: float) -> None:
     scan = scans["20 % along the street"]
-    turned = Rotation.from_euler("z", turn_deg, degrees=True).apply(scan.points).astype(np.float32)
-    difference = scan_heights(turned, HEIGHT_M) - scan_heights(scan.points, HEIGHT_M)
+    rotated = Rotation.from_euler("z", turn_deg, degrees=True).apply(scan.points).astype(np.float32)
+    difference = scan_heights(rotated, HEIGHT_M) - scan_heights(scan.points, HEIGHT_M)
     near = np.hypot(scan.points[:, 0], scan.points[:, 1]) < 40
     assert np.percentile(np.abs(difference[near]), 95) < 0.25
 
@@ -250,7 +250,7 @@ def a_survey(terrain: Callable[[Array, Array], Array], seed: int = 0) -> tuple[A
     [plane(0, 0), plane(0.2, 0), plane(0.1, -0.1), lambda x, y: 6 * np.sin(x / 40) + 5 * np.cos(y / 35)],
     ids=["flat", "20 % slope", "diagonal slope", "hills"],
 )
-def test_aerial_ground_is_told_from_houses_cars_and_trees(terrain: Callable[[Array, Array], Array]) -> None:
+def test_aerial_ground_is_separated_from_houses_cars_and_trees(terrain: Callable[[Array, Array], Array]) -> None:
     points, ground = a_survey(terrain)
     found = classify_ground(points)
     assert np.mean(ground[found]) > 0.985  # precision

@@ -33,7 +33,7 @@ def place(seed: int) -> Float32Array:
     return np.column_stack((xy, rng.uniform(0.01, 1.0, 2500) * height[owner])).astype(np.float32)
 
 
-def turned(points: Float32Array, angle_rad: float) -> Float32Array:
+def rotated(points: Float32Array, angle_rad: float) -> Float32Array:
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return (points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).astype(np.float32)
 
@@ -64,7 +64,7 @@ def test_a_raster_holds_the_greatest_heights() -> None:
     assert np.count_nonzero(raster) == 3
 
 
-def test_the_distance_is_the_least_over_plain_turns() -> None:
+def test_the_distance_is_the_least_over_plain_rotations() -> None:
     matcher = HeightMatcher(PLAIN, 50.0)
     scans = rasters(*(place(seed) for seed in range(2)))
     submaps = rasters(*(place(seed) for seed in range(4)))
@@ -83,17 +83,17 @@ def test_the_distance_is_the_least_over_plain_turns() -> None:
                 for turn in range(SECTORS)
             ]
             assert match.distances[i, j] == pytest.approx(min(plain), abs=2e-3)
-            told = round(match.headings_rad[i, j] / (2 * math.pi) * SECTORS)
-            assert plain[told] == pytest.approx(min(plain), abs=2e-3)
+            found = round(match.headings_rad[i, j] / (2 * math.pi) * SECTORS)
+            assert plain[found] == pytest.approx(min(plain), abs=2e-3)
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 60.0, 210.0])
-def test_heading_and_offset_are_told(heading_deg: float) -> None:
+def test_heading_and_offset_are_found(heading_deg: float) -> None:
     matcher = HeightMatcher(HeightMapConfig(smooth=0), 50.0)
     survey = place(3)
     robot_m = np.array([7.0, -3.5])  # from the submap's centre, east and north
     seen = survey - np.array([*robot_m / 50.0, 0.0], np.float32)
-    scan = turned(seen, -math.radians(heading_deg))
+    scan = rotated(seen, -math.radians(heading_deg))
     match = matcher.match(rasters(scan), rasters(survey, *(place(seed) for seed in range(10, 20))))
     assert match.distances[0].argmin() == 0
     assert match.headings_rad[0, 0] == pytest.approx(math.radians(heading_deg), abs=math.radians(6.1))

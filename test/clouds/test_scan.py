@@ -91,13 +91,13 @@ def test_the_same_scan_gives_the_same_patch_in_any_order(town: Cloud) -> None:
 )
 def test_however_the_sensor_is_mounted_the_patch_is_the_same(town: Cloud, mounting: MountingConfig) -> None:
     straight = prepare(town)
-    turned = prepare(town, mounting_matrix(mounting))
-    assert distance_m(straight.patch, turned.patch) < 0.15
+    rotated = prepare(town, mounting_matrix(mounting))
+    assert distance_m(straight.patch, rotated.patch) < 0.15
     config = replace(CONFIG, mounting=mounting)
     seen = scan_of(transform_points(np.linalg.inv(mounting_matrix(mounting)), town))
     by_config = prepare_scan(seen, config, PREPROCESSING)
-    assert by_config.patch is not None and turned.patch is not None
-    np.testing.assert_array_equal(by_config.patch.points, turned.patch.points)
+    assert by_config.patch is not None and rotated.patch is not None
+    np.testing.assert_array_equal(by_config.patch.points, rotated.patch.points)
 
 
 def test_the_patch_is_centred_on_the_sensor(town: Cloud) -> None:
@@ -247,7 +247,7 @@ def test_the_real_outdoor_scans_ground_goes_even_with_a_wrong_height(
 @pytest.mark.parametrize(
     "mounting",
     [MountingConfig(z_m=1.2), MountingConfig(x_m=1.5, y_m=-0.7, z_m=1.2, yaw_deg=80.0, roll_deg=-6.0)],
-    ids=["straight", "turned and offset"],
+    ids=["straight", "rotated and offset"],
 )
 def test_the_place_holds_each_usable_point_level_and_above_the_ground(
     cast: Callable[..., Any], mounting: MountingConfig, lean_deg: float

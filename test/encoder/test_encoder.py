@@ -161,7 +161,7 @@ def test_weights_survive_the_disk(model: CrossLoc3D, tmp_path: Path) -> None:
     assert checkpoint.metadata == {"training": "none"}
     assert checkpoint.fingerprint == fingerprint(model, preprocessing)
     cloud = street(500, 1)
-    # The fingerprint holds the weights to the bit; products may round otherwise where weights lie elsewhere in memory.
+    # The fingerprint holds the weights to the bit; products may round otherwise where weights lie at other addresses.
     assert np.abs(describe(checkpoint.model, [cloud]) - describe(model, [cloud])).max() < 1e-5
     assert [p.name for p in tmp_path.iterdir()] == ["weights.safetensors"]
 

@@ -127,7 +127,7 @@ def test_weights_survive_the_disk_and_serve_an_encoder(name: str, tmp_path: Path
     assert checkpoint.fingerprint == fingerprint(network, PreprocessingConfig())
     points = cloud(300, 1)
     expected = describe(network, [points])[0]
-    # The fingerprint holds the weights to the bit; products may round otherwise where weights lie elsewhere in memory.
+    # The fingerprint holds the weights to the bit; products may round otherwise where weights lie at other addresses.
     assert np.abs(describe(checkpoint.model, [points])[0] - expected).max() < 1e-5 * np.abs(expected).max()
     encoder = load_encoder(path)
     assert encoder.model_config.network == name
@@ -244,13 +244,13 @@ def test_spherical_steps_are_those_of_plain_trigonometry() -> None:
     assert steps[3, 1] == pytest.approx(180.0, abs=0.2)  # just short of a full turn, not just below nothing
 
 
-def test_a_turn_moves_bearings_alone() -> None:
+def test_a_rotation_moves_bearings_alone() -> None:
     points = cloud(300, 8).double()
     angle = math.radians(14.0)
-    turned = points.clone()
-    turned[:, 0] = math.cos(angle) * points[:, 0] - math.sin(angle) * points[:, 1]
-    turned[:, 1] = math.sin(angle) * points[:, 0] + math.cos(angle) * points[:, 1]
-    before, after = spherical_steps(points, 0.05), spherical_steps(turned, 0.05)
+    rotated = points.clone()
+    rotated[:, 0] = math.cos(angle) * points[:, 0] - math.sin(angle) * points[:, 1]
+    rotated[:, 1] = math.sin(angle) * points[:, 0] + math.cos(angle) * points[:, 1]
+    before, after = spherical_steps(points, 0.05), spherical_steps(rotated, 0.05)
     assert torch.allclose(before[:, [0, 2]], after[:, [0, 2]], atol=1e-4)
     assert torch.allclose(torch.remainder(after[:, 1] - before[:, 1] - 7.0 + 90, 180.0), torch.tensor(90.0), atol=1e-3)
 
@@ -268,7 +268,7 @@ def test_voxel_means_are_the_means_of_the_voxels() -> None:
     assert torch.allclose(voxel_means(points, 0.2), expected, atol=1e-6)
 
 
-def test_local_features_tell_a_wall_from_a_pole_from_a_roof() -> None:
+def test_local_features_separate_a_wall_from_a_pole_from_a_roof() -> None:
     rng = np.random.default_rng(0)
     n = 60
     wall = np.column_stack((rng.uniform(0, 0.2, n), np.zeros(n), rng.uniform(0, 0.2, n)))

@@ -1,4 +1,4 @@
-"""The option that tells voxels where they lie."""
+"""The position embedding of the voxels."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def test_compiled_network_embeds_as_torch_does(kind: str, threads: int) -> None:
     np.testing.assert_allclose(compiled.encode(clouds[0]), expected[0], atol=1e-5)
 
 
-def test_radial_embedding_does_not_mind_turns_and_cartesian_does() -> None:
+def test_radial_embedding_is_invariant_to_rotations_and_cartesian_is_not() -> None:
     places = _cloud(1)
-    turned = rotate_about_z(places, 1.0)
+    rotated = rotate_about_z(places, 1.0)
     for kind, equal in (("radial", True), ("cartesian", False)):
         embedding = PositionEmbedding(kind, 8)
         torch.nn.init.normal_(embedding.linear.weight)
         with torch.no_grad():
-            before, after = embedding(torch.from_numpy(places)), embedding(torch.from_numpy(turned))
+            before, after = embedding(torch.from_numpy(places)), embedding(torch.from_numpy(rotated))
         assert torch.allclose(before, after, atol=1e-4) == equal
 
 

@@ -161,7 +161,7 @@ def test_real_recordings_are_read(shared, name: str, scans: int) -> None:
         assert len(message.message.data) == 22 * message.message.width * message.message.height > 0
 
 
-def test_no_topics_asked_for_means_none(tmp_path: Path) -> None:
+def test_no_topics_chosen_means_none(tmp_path: Path) -> None:
     with bag.open_bag(write_bag(tmp_path / "drive")) as reader:
         assert list(reader.messages([])) == []
         assert list(reader.messages(["/nothing"])) == []
@@ -310,7 +310,7 @@ except BagError as error:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_full_disk_is_said_and_leaves_nothing(tmp_path: Path, storage: bag.Storage) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing(tmp_path: Path, storage: bag.Storage) -> None:
     path = tmp_path / "drive"
     done = subprocess.run(
         [sys.executable, "-c", FILL_THE_DISK, str(path), storage], capture_output=True, text=True, timeout=120

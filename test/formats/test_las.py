@@ -111,7 +111,7 @@ def test_every_crs_comes_back(tmp_path: Path, crs: str) -> None:
 
 
 def with_geokeys(path: Path, keys: dict[int, int]) -> None:
-    """Write a LAS 1.2 file that says its CRS by GeoTIFF keys, as most files older than 2013 do."""
+    """Write a LAS 1.2 file that names its CRS by GeoTIFF keys, as most files older than 2013 do."""
     header = laspy.LasHeader(point_format=1, version="1.2")
     record = GeoKeyDirectoryVlr()
     record.geo_keys = [
@@ -153,14 +153,14 @@ def test_geotiff_keys_are_understood(
 
 
 @pytest.mark.parametrize("keys", [{1024: 1, 3072: 32767}, {1024: 1}, {1024: 2, 2048: 1025}])
-def test_geotiff_keys_without_a_known_code_ask_for_the_crs(tmp_path: Path, keys: dict[int, int]) -> None:
+def test_geotiff_keys_without_a_known_code_need_the_crs(tmp_path: Path, keys: dict[int, int]) -> None:
     with_geokeys(tmp_path / "a.las", keys)
     with pytest.raises(AerialDataError, match=r"a\.las.*--crs"):
         read_header(tmp_path / "a.las")
     assert read_header(tmp_path / "a.las", "EPSG:28992").crs == "EPSG:28992"
 
 
-def test_a_file_without_crs_asks_for_it(tmp_path: Path) -> None:
+def test_a_file_without_crs_needs_it(tmp_path: Path) -> None:
     write_laz(tmp_path / "a.laz", *cloud(10), None)
     with pytest.raises(AerialDataError, match=r"a\.laz names no CRS.*--crs EPSG"):
         read_header(tmp_path / "a.laz")
@@ -170,7 +170,7 @@ def test_a_file_without_crs_asks_for_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "message"), [("", "names no CRS"), ("\0\0", "names no CRS"), ("PROJCS[", "--crs")])
-def test_a_broken_crs_record_asks_for_the_crs(tmp_path: Path, text: str, message: str) -> None:
+def test_a_broken_crs_record_needs_the_crs(tmp_path: Path, text: str, message: str) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.vlrs.append(WktCoordinateSystemVlr(text))
     laspy.LasData(header).write(tmp_path / "a.laz")

@@ -93,7 +93,7 @@ class Attack:
         self.call = function, arguments
 
     def __reduce__(self) -> Any:
-        """Ask for the call."""
+        """Name the call."""
         return self.call
 
 

@@ -30,7 +30,7 @@ def message(
     row_padding: int = 0,
     wrap: Callable[[bytes], Any] = bytes,
 ) -> SimpleNamespace:
-    """Lay points out as told; `gaps` are the unused bytes before each field and at the end."""
+    """Lay points out as given; `gaps` are the unused bytes before each field and at the end."""
     order = ">" if big else "<"
     fields, dtype = [], {"names": [], "formats": [], "offsets": []}
     offset = 0

@@ -55,7 +55,7 @@ def posed(about: Belief, gravity: Float64Array | None = None) -> Estimate:
     )
 
 
-def test_the_heading_is_turned_from_the_grid_s_north_to_the_true_one() -> None:
+def test_the_heading_is_rotated_from_the_grid_s_north_to_the_true_one() -> None:
     about = belief([ORIGIN[0] + 900.0, ORIGIN[1] + 1500.0, 36.0])
     found = posed(about)
     ahead = about.grid + 10.0 * np.array([math.cos(about.heading_rad), math.sin(about.heading_rad), 0.0])
@@ -72,17 +72,17 @@ def test_the_heading_is_turned_from_the_grid_s_north_to_the_true_one() -> None:
     assert found.probability == 0.9995
 
 
-def test_the_covariance_turns_with_the_frame() -> None:
+def test_the_covariance_rotates_with_the_frame() -> None:
     about = belief([ORIGIN[0] + 900.0, ORIGIN[1] + 1500.0, 36.0])
     found = posed(about)
     rows = [0, 1, 5]
-    turned = found.pose_covariance[np.ix_(rows, rows)]
-    np.testing.assert_allclose(np.linalg.eigvalsh(turned), np.linalg.eigvalsh(about.covariance), rtol=1e-9)
+    rotated = found.pose_covariance[np.ix_(rows, rows)]
+    np.testing.assert_allclose(np.linalg.eigvalsh(rotated), np.linalg.eigvalsh(about.covariance), rtol=1e-9)
     # The standard deviation along the robot's axis is the same in grid and map.
     along_grid = np.array([math.cos(about.heading_rad), math.sin(about.heading_rad)])
     along_map = found.T_map_base[:2, 0]
-    assert along_map @ turned[:2, :2] @ along_map == pytest.approx(along_grid @ about.covariance[:2, :2] @ along_grid)
-    assert turned[2, 2] == pytest.approx(about.covariance[2, 2])
+    assert along_map @ rotated[:2, :2] @ along_map == pytest.approx(along_grid @ about.covariance[:2, :2] @ along_grid)
+    assert rotated[2, 2] == pytest.approx(about.covariance[2, 2])
     assert np.diag(found.pose_covariance)[[2, 3, 4]].tolist() == [HEIGHT_STD_M**2, TILT_STD_RAD**2, TILT_STD_RAD**2]
     np.testing.assert_array_equal(found.covariance, found.pose_covariance[:3, :3])
     assert (np.linalg.eigvalsh(found.pose_covariance) > 0.0).all()

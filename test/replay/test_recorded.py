@@ -44,7 +44,7 @@ def test_every_scan_gets_a_row_and_the_truth_is_where_it_was(
     assert evaluation.truth is not None
     assert (len(evaluation.truth), evaluation.truth.dropped) == (len(table) - 2, 2)
     known = np.isfinite(table.truth_grid[:, 0])
-    assert not known[-1]  # after the last fix nobody knows
+    assert not known[-1]  # after the last fix nothing is known
     assert known[:-1].all()
     np.testing.assert_allclose(table.truth_grid[known], town_drive.truth[known, :2], atol=0.02)
 
@@ -60,7 +60,7 @@ def test_a_localizer_that_sees_well_scores_well(evaluation: drive_evaluation.Eva
     assert scores.reachable == 1.0
 
 
-def test_straight_through_is_what_the_localizer_says(town_drive, localizer: Localizer, folder: Path) -> None:
+def test_straight_through_is_what_the_localizer_returns(town_drive, localizer: Localizer, folder: Path) -> None:
     from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 
     table = read_estimates(folder / drive_evaluation.ESTIMATES)
@@ -142,7 +142,7 @@ def test_scans_without_a_stamp_take_the_time_of_recording(localizer: Localizer, 
     assert read_estimates(tmp_path / "e.csv").stamp_ns.tolist() == [1_234_567_890_123_456_789]
 
 
-def test_a_topic_that_is_missing_or_empty_is_said(town_drive, localizer: Localizer, tmp_path: Path) -> None:
+def test_a_topic_that_is_missing_or_empty_is_reported(town_drive, localizer: Localizer, tmp_path: Path) -> None:
     with bag.open_bag(town_drive.bag) as reader, pytest.raises(BagError, match="its topics are: /gnss"):
         replay.localize_bag(reader, "/points", localizer, tmp_path / "e.csv")
     with bag.BagWriter(tmp_path / "drive") as writer:
@@ -153,7 +153,7 @@ def test_a_topic_that_is_missing_or_empty_is_said(town_drive, localizer: Localiz
 
 
 def test_an_imu_levels_the_scans(town_drive, localizer: Localizer, tmp_path: Path) -> None:
-    """A robot that leans by 8 degrees and says so finds what it finds upright."""
+    """A robot that leans by 8 degrees and measures it finds what it finds upright."""
     lean = np.radians(8.0)
     turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
     mount = np.array([0.0, 0.0, 1.2])
@@ -176,7 +176,7 @@ def test_an_imu_levels_the_scans(town_drive, localizer: Localizer, tmp_path: Pat
     assert np.median(found["/imu"]) < np.median(found[None])
 
 
-def test_the_summary_says_what_the_table_says(folder: Path, evaluation: drive_evaluation.Evaluation) -> None:
+def test_the_summary_holds_what_the_table_holds(folder: Path, evaluation: drive_evaluation.Evaluation) -> None:
     summary = json.loads((folder / drive_evaluation.SUMMARY).read_text())
     assert evaluation.scores is not None
     assert summary["scans"] == len(evaluation.table)

@@ -1,4 +1,4 @@
-"""What a localizer is told of the robot's motion between the scans of a recording."""
+"""What a localizer is given of the robot's motion between the scans of a recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SECOND = 1_000_000_000
 
 @dataclass
 class Listener:
-    """Stands in for the localizer, and remembers what it was told."""
+    """Stands in for the localizer, and records what it was given."""
 
     config: LocalizerConfig = field(default_factory=LocalizerConfig)
     stamps_ns: list[int] = field(default_factory=list)
@@ -132,7 +132,7 @@ def test_of_every_second_scan_the_motion_is_that_since_the_last_one_used(tmp_pat
         np.testing.assert_allclose(motion.delta, [10 * np.sin(0.2), 10 * (1 - np.cos(0.2)), 0.2], atol=2e-3)
 
 
-def test_without_odometry_nothing_is_told(tmp_path: Path) -> None:
+def test_without_odometry_nothing_is_given(tmp_path: Path) -> None:
     path = drive(tmp_path / "drive")
     listener = Listener()
     with bag.open_bag(path) as reader:
@@ -188,7 +188,7 @@ def test_poses_that_are_none_are_left_out(tmp_path: Path) -> None:
         np.testing.assert_allclose(motion.delta, [10 * np.sin(0.1), 10 * (1 - np.cos(0.1)), 0.1], atol=0.01)
 
 
-def test_odometry_of_another_frame_is_used_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_odometry_of_another_frame_is_used_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorded: list[tuple[str, str, int, Any]] = [
         ("/odom", bag.ODOMETRY, START + i, odometry(START + i, 0.0, child="base_footprint")) for i in range(3)
     ]
@@ -216,8 +216,8 @@ def test_of_a_damaged_recording_the_scans_that_wait_are_kept(tmp_path: Path, mon
     assert 2 < len(seen) < 6
 
 
-def test_scans_tell_the_motion_themselves(tmp_path: Path) -> None:
-    """All of them, also those that are not localized; on a lidar that looks to the left, in the axes of the base."""
+def test_scans_measure_the_motion_themselves(tmp_path: Path) -> None:
+    """All of them, also those that are not localized; on a lidar that faces left, in the axes of the base."""
     pytest.importorskip("kiss_icp")
     recorded: list[tuple[str, str, int, Any]] = []
     for i in range(9):

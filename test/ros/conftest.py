@@ -61,7 +61,7 @@ SMALL_MODEL = ModelConfig(
 )  # fmt: skip
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FIRST_ANSWER_S = 240.0
-"""What a node may need until it answers: on a busy machine numba compiles for minutes when it first runs."""
+"""What a node may need until its first output: on a busy machine numba compiles for minutes when it first runs."""
 
 
 def points_of_place(seed: int, points: int = 14_400) -> npt.NDArray[np.float32]:
@@ -103,7 +103,7 @@ class World:
     weights_path: Path
     other_weights_path: Path
     null_distance: float
-    """Half of what lies between the two places that look most alike."""
+    """Half of what lies between the two places that are most similar."""
 
     def parameters(self) -> dict[str, object]:
         return {
@@ -148,7 +148,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     descriptors = np.concatenate([encoder.encode_batch([patch]) for patch in patches])
     gaps = np.linalg.norm(descriptors[:, None] - descriptors[None], axis=-1)
     null_distance = 0.5 * float(gaps[np.triu_indices(PLACES, 1)].min())
-    assert null_distance > 1e-4, "weights without training must tell these places apart"
+    assert null_distance > 1e-4, "weights without training must separate these places"
 
     map_path = folder / "map"
     map_path.mkdir()
@@ -293,7 +293,7 @@ class Robot:
     imu: Any
     guesses: Any
     stamps_ns: Iterator[int]
-    """Every stamp occurs once in a test run: what an earlier test left latched is no answer to this one."""
+    """Every stamp occurs once in a test run: what an earlier test left latched is no output of this one."""
     fixes: list[NavSatFix] = field(default_factory=list)
     poses: list[PoseWithCovarianceStamped] = field(default_factory=list)
     candidates: list[PoseArray] = field(default_factory=list)
@@ -323,7 +323,7 @@ class Robot:
             self.executor.spin_once(timeout_sec=0.02)
 
     def wait_for_localizer(self) -> None:
-        """Wait until the node is active and hears this robot, and the robot hears it."""
+        """Wait until the node is active and receives from this robot, and the robot from it."""
         self.wait_until(lambda: self.state() == "active", FIRST_ANSWER_S, "for the node to be active")
         self.wait_until(lambda: self.clouds.get_subscription_count() > 0, what="for the subscription")
         self.wait_until(lambda: self.node.count_publishers("/localizer/fix") > 0, what="for the fix")
@@ -354,7 +354,7 @@ class Robot:
                         return fix
         raise AssertionError("no fix came back")
 
-    def told(self, message: PointCloud2) -> tuple[int, str, dict[str, str]]:
+    def report(self, message: PointCloud2) -> tuple[int, str, dict[str, str]]:
         """Level, message and values of the state after the scan; what the stand-in was handed stands in the message."""
         stamp = message.header.stamp
         stamp_ns = str(stamp.sec * 1_000_000_000 + stamp.nanosec)
@@ -375,20 +375,20 @@ class Robot:
         try:
             self.wait_until(client.service_is_ready, timeout_s, f"for service {name}")
             future = client.call_async(request)
-            self.wait_until(future.done, timeout_s, f"for an answer of {name}")
+            self.wait_until(future.done, timeout_s, f"for a response of {name}")
             return future.result()
         finally:
             self.node.destroy_client(client)
 
     def state(self, node: str = "/localizer", timeout_s: float = FIRST_ANSWER_S) -> str:
-        """State of the lifecycle, asked for again where the answer is lost: the service may know us before we do."""
+        """State of the lifecycle, requested again where the response is lost: discovery has two ends."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:
-                answer = self.call(GetState, f"{node}/get_state", GetState.Request(), 20.0)
-                return str(answer.current_state.label)
+                response = self.call(GetState, f"{node}/get_state", GetState.Request(), 20.0)
+                return str(response.current_state.label)
             except AssertionError:
-                assert time.monotonic() < deadline, f"no answer of {node}/get_state"
+                assert time.monotonic() < deadline, f"no response of {node}/get_state"
 
     def change_state(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=int(transition)))
@@ -399,7 +399,7 @@ class Robot:
         seen = len(self.diagnostics)
         self.wait_until(
             lambda: len(self.diagnostics) > seen and words in self.diagnostics[-1].status[0].message,
-            what=f"for diagnostics that say '{words}'",
+            what=f"for diagnostics that hold '{words}'",
         )
         status = self.diagnostics[-1].status[0]
         return status.level[0], status.message, {v.key: v.value for v in status.values}
@@ -408,10 +408,10 @@ class Robot:
         """Level, message and values of the next diagnostics whose value of `key` holds `words`."""
         deadline = time.monotonic() + 15.0
         while time.monotonic() < deadline:
-            told = self.diagnosis()
-            if words in told[2].get(key, ""):
-                return told
-        raise AssertionError(f"no diagnostics say '{words}' of '{key}': {told[2]}")
+            found = self.diagnosis()
+            if words in found[2].get(key, ""):
+                return found
+        raise AssertionError(f"no diagnostics hold '{words}' of '{key}': {found[2]}")
 
 
 @pytest.fixture(scope="session")

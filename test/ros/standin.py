@@ -1,7 +1,7 @@
 """The localizer node with a localizer that finds places and makes up the rest, so that the node alone is tested.
 
 Run as a program, it is the command `localizer` but for that. What the node hands over comes back in the reasons. With
-STANDIN_TF2 set it also has a tf2_ros, which the package index lacks: transforms that are sent go to /tf_told, and the
+STANDIN_TF2 set it also has a tf2_ros, which the package index lacks: transforms that are sent go to /tf_sent, and the
 frames `odom_far` and `velodyne` are known.
 """
 
@@ -29,7 +29,7 @@ from crossloc3d_ros.types import WHOLE_MAP, AlignedPoses, Estimate, FixStatus, H
 HEADING_RAD = 0.5
 """Of every pose that it makes up, from grid east."""
 OFFSET_M = np.array([3.0, -2.0, 0.0])
-"""From a candidate to where the scan is said to fit around it."""
+"""From a candidate to where the stand-in aligns the scan around it."""
 MIN_PROBABILITY = 0.7
 
 
@@ -96,7 +96,7 @@ class StandIn:
         return Estimate(
             stamp_ns=scan.stamp_ns,
             status=FixStatus.FIX if is_fix else FixStatus.NO_FIX,
-            reason=f"believed {probability:.0%}; {self._told(motion)}",
+            reason=f"probability {probability:.0%}; {self._motion_text(motion)}",
             grid=grid[0],
             enu=enu,
             latitude_deg=float(latitude[0]),
@@ -113,7 +113,7 @@ class StandIn:
             hypotheses=hypotheses,
         )
 
-    def _told(self, motion: Any) -> str:
+    def _motion_text(self, motion: Any) -> str:
         parts = [f"resets {self.resets}"]
         if motion is None:
             parts.append("no motion")
@@ -138,7 +138,7 @@ def load_stand_in(config: LocalizerNodeConfig) -> Any:
 
 
 def install_tf2() -> None:
-    """Put a tf2_ros in place that knows two frames and sends to a topic that a test can hear."""
+    """Put a tf2_ros in place with two frames that publishes to a topic a test can subscribe to."""
     from geometry_msgs.msg import TransformStamped
 
     known = {("map", "odom_far"): ((100.0, 50.0, 0.0), math.pi / 2), ("base_link", "velodyne"): ((0.0, 0.0, 1.2), 0.0),
@@ -168,7 +168,7 @@ def install_tf2() -> None:
 
     class TransformBroadcaster:
         def __init__(self, node: Any) -> None:
-            self.pub_tf = node.create_publisher(TransformStamped, "/tf_told", 100)
+            self.pub_tf = node.create_publisher(TransformStamped, "/tf_sent", 100)
 
         def sendTransform(self, transform: TransformStamped) -> None:  # noqa: N802 - tf2's own name
             self.pub_tf.publish(transform)

@@ -93,7 +93,7 @@ def test_node_and_replay_give_the_same_estimates_and_no_wrong_fix(
             parameters={"queue_depth": "100", "odometry_timeout_s": "1.0"},
             log_path=tmp_path / "localizer.log", domain=domain,
         )  # fmt: skip
-        assert report.answers == report.scans, (tmp_path / "localizer.log").read_text()
+        assert report.estimates == report.scans, (tmp_path / "localizer.log").read_text()
         localizer = Localizer(aerial_map, load_encoder(), LocalizerNodeConfig())
         localizer.warm_up()
         localize_bag(reader, CLOUDS, localizer, tmp_path / "replay.csv", odometry=OdometrySource(ODOM))
@@ -106,7 +106,7 @@ def test_node_and_replay_give_the_same_estimates_and_no_wrong_fix(
     fixes = live.has_fix
     assert fixes.sum() >= 10, "a drive that tests something"
     np.testing.assert_allclose(live.grid[fixes, :2], replayed.grid[fixes, :2], atol=0.01)
-    # Without the geoid's separation the topic has no altitude, and says so by its variance.
+    # Without the geoid's separation the topic has no altitude, and a variance that shows it.
     plane = np.ix_(fixes, [0, 1], [0, 1])
     np.testing.assert_allclose(live.covariance[plane], replayed.covariance[plane], rtol=0.01, atol=1e-4)
     error = np.hypot(*(live.grid[fixes, :2] - truth.at(live.stamp_ns[fixes])[:, :2]).T)
@@ -160,8 +160,8 @@ def spoil(topic: str, seconds: float, message: Any) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def answers(spoiled: Drive, ros_environment: Any, domain: int, tmp_path_factory: Any) -> EstimateTable:
-    folder = tmp_path_factory.mktemp("answers")
+def estimates(spoiled: Drive, ros_environment: Any, domain: int, tmp_path_factory: Any) -> EstimateTable:
+    folder = tmp_path_factory.mktemp("estimates")
     with bag.open_bag(spoiled.bag_path) as reader:
         localize_live(
             reader, CLOUDS, spoiled.map_path, AerialMap.load(spoiled.map_path).frame, folder / "estimates.csv",
@@ -173,22 +173,22 @@ def answers(spoiled: Drive, ros_environment: Any, domain: int, tmp_path_factory:
 
 @pytest.mark.slow
 def test_no_fix_is_wrong_whatever_goes_wrong_and_each_time_it_comes_back(
-    spoiled: Drive, answers: EstimateTable
+    spoiled: Drive, estimates: EstimateTable
 ) -> None:
-    truth = spoiled.grid[np.searchsorted(spoiled.stamps_ns, answers.stamp_ns)]
-    error = np.hypot(*(answers.grid[:, :2] - truth[:, :2]).T)
-    seconds = (answers.stamp_ns - spoiled.start_ns) / 1e9
+    truth = spoiled.grid[np.searchsorted(spoiled.stamps_ns, estimates.stamp_ns)]
+    error = np.hypot(*(estimates.grid[:, :2] - truth[:, :2]).T)
+    seconds = (estimates.stamp_ns - spoiled.start_ns) / 1e9
     seconds = np.where(seconds < 0, seconds + BEFORE_NS / 1e9, seconds)
     phases = np.array([phase_of(t) for t in seconds])
-    fixes = answers.has_fix
-    told = "\n".join(
+    fixes = estimates.has_fix
+    course = "\n".join(
         f"{t:5.1f} {p:17} {s and s.value} {f} {e:6.2f} {r[:100]}"
-        for t, p, s, f, e, r in zip(seconds, phases, answers.states, fixes, error, answers.reasons, strict=True)
+        for t, p, s, f, e, r in zip(seconds, phases, estimates.states, fixes, error, estimates.reasons, strict=True)
     )
-    assert error[fixes].max() < 10.0, told
-    assert np.median(error[fixes]) < 1.0, told
+    assert error[fixes].max() < 10.0, course
+    assert np.median(error[fixes]) < 1.0, course
     for phase in ("good", "good again", "odometry again", "time begins anew"):
         last = np.flatnonzero(phases == phase)[-8:]
-        assert fixes[last].any(), f"no fix at the end of '{phase}':\n{told}"
+        assert fixes[last].any(), f"no fix at the end of '{phase}':\n{course}"
     upside_down = np.flatnonzero(phases == "upside down")[1:]
-    assert not fixes[upside_down].any(), told
+    assert not fixes[upside_down].any(), course

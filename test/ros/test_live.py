@@ -1,4 +1,4 @@
-"""The demo's engine: the localizer as a process, a recording played into it, its answers as estimates."""
+"""The demo's engine: the localizer as a process, a recording played into it, its outputs as estimates."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_drive(path: Path, world: Any) -> Path:
     return path
 
 
-def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, domain: int, tmp_path: Path) -> None:
+def test_outputs_of_the_node_become_estimates(world: Any, ros_environment: Any, domain: int, tmp_path: Path) -> None:
     parameters = {name: str(value) for name, value in world.parameters().items() if name != "map"}
     frame = AerialMap.load(world.map_path).frame
     calls: list[tuple[int, int]] = []
@@ -60,20 +60,20 @@ def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, 
     assert calls == [(i + 1, SCANS) for i in range(SCANS)]
     assert report.scans == SCANS
     assert table.stamp_ns.tolist() == [START_NS + i * STEP_NS for i in range(SCANS)]
-    answered = np.isfinite(table.latency_ms)
-    assert report.answers == answered.sum() >= SCANS - 3  # a busy machine may drop some
-    assert (table.latency_ms[answered] > 0).all()
-    assert answered[5]
+    received = np.isfinite(table.latency_ms)
+    assert report.estimates == received.sum() >= SCANS - 3  # a busy machine may drop some
+    assert (table.latency_ms[received] > 0).all()
+    assert received[5]
     assert not table.has_fix[5]
     assert table.candidate_ids[5, 0] == -1
-    good = answered & (np.arange(SCANS) != 5)
+    good = received & (np.arange(SCANS) != 5)
     assert table.has_fix[good].mean() > 0.7
     for i in np.flatnonzero(good):
         assert table.candidate_ids[i, 0] == i
         np.testing.assert_allclose(table.candidate_grid[i, 0], world.grid(i)[:2], atol=0.05)
         assert table.candidate_probabilities[i, 0] > table.candidate_probabilities[i, 1]
         if table.has_fix[i]:
-            # The stand-in puts the robot 3 m east and 2 m south of the place, and turns it by half a radian.
+            # The stand-in puts the robot 3 m east and 2 m south of the place, and rotates it by half a radian.
             made_up = np.array(world.grid(i)[:2]) + np.array([3.0, -2.0])
             np.testing.assert_allclose(table.grid[i, :2], made_up, atol=0.01)
             assert table.covariance[i, 0, 0] == pytest.approx(0.04)
@@ -89,8 +89,8 @@ def test_answers_of_the_node_become_estimates(world: Any, ros_environment: Any, 
             assert table.aligned_sources[i, 0] == 0
     moved = [reason for reason in table.reasons if "moved 0.50 0.00 0.000" in reason]
     assert len(moved) >= SCANS - 5, "the odometry reaches the localizer"
-    for i in np.flatnonzero(~answered):
-        assert "no answer" in table.reasons[i]
+    for i in np.flatnonzero(~received):
+        assert "no estimate" in table.reasons[i]
 
 
 def test_a_node_that_does_not_come_up_says_why(world: Any, ros_environment: Any, domain: int, tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_the_candidates_come_as_poses_as_a_table_and_as_markers(active: Robot, w
     assert rows["submap_id"][0] == 9
     assert rows["probability"].sum() == pytest.approx(1.0, abs=0.01)
     assert rows["latitude"][0] == pytest.approx(world.latitude_longitude(9)[0], abs=1e-9)
-    # Two poses fit around the first candidate, of which the likelier is told, none around the last.
+    # Two poses fit around the first candidate, of which the likelier is published, none around the last.
     position, yaw = pose_in_map(world, 9)
     np.testing.assert_allclose([rows["aligned_x"][0], rows["aligned_y"][0]], position[:2], atol=1e-3)
     assert rows["aligned_yaw"][0] == pytest.approx(yaw, abs=1e-5)
@@ -145,13 +145,13 @@ def test_the_candidates_come_as_poses_as_a_table_and_as_markers(active: Robot, w
     assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw, abs=1e-6)
     active.wait_until(lambda: active.markers, what="for markers")
     assert len(active.markers[-1].markers) == 1 + 25 + 2 + 2
-    assert any("believed 100%" in m.text for m in active.markers[-1].markers)
+    assert any("probability 100%" in m.text for m in active.markers[-1].markers)
 
 
 def test_the_state_is_latched_and_says_why(active: Robot, world: World) -> None:
-    level, message, values = active.told(active.message(world.points(10)))
+    level, message, values = active.report(active.message(world.points(10)))
     assert level == 0
-    assert message.startswith("localized: believed 100%")
+    assert message.startswith("localized: probability 100%")
     assert values["fix"] == "yes"
     assert values["hypotheses"] == "0.9 0.06"
     assert values["deviation (m, m, deg)"] == "0.20 0.30 0.57"
@@ -160,7 +160,7 @@ def test_the_state_is_latched_and_says_why(active: Robot, world: World) -> None:
     subscription = active.node.create_subscription(DiagnosticStatus, "/localizer/state", late.append, latched)
     active.wait_until(lambda: late, what="for the latched state")
     assert late[0].message == message
-    level, message, values = active.told(active.message(np.full((20_000, 3), np.nan)))
+    level, message, values = active.report(active.message(np.full((20_000, 3), np.nan)))
     assert level == 1
     assert message.startswith("localized: 0 of 20,000 points left"), "such a scan changes nothing that is known"
     assert values["fix"] == "no"
@@ -187,32 +187,32 @@ def test_odometry_reaches_the_localizer_as_the_way_from_scan_to_scan(active: Rob
     active.call(Empty, "/reinitialize_global_localization", Empty.Request())
     first, second, third = (active.message(world.points(place)) for place in (11, 12, 13))
     drive_between(active, first, second, 0.7)
-    assert active.told(first)[1].endswith("no motion")
-    assert active.told(second)[1].endswith("moved 0.70 0.00 0.000")
-    # The same stamp again, and one that comes late: nothing that odometry could tell.
-    assert active.told(second)[1].endswith("moved 0.00 0.00 0.000")
-    assert "unknown motion (time goes backwards" in active.told(first)[1]
+    assert active.report(first)[1].endswith("no motion")
+    assert active.report(second)[1].endswith("moved 0.70 0.00 0.000")
+    # The same stamp again, and one that comes late: no motion that odometry could measure.
+    assert active.report(second)[1].endswith("moved 0.00 0.00 0.000")
+    assert "unknown motion (time goes backwards" in active.report(first)[1]
     drive_between(active, second, third, 40.0)
-    assert "unknown motion (the odometry jumps by" in active.told(third)[1]
+    assert "unknown motion (the odometry jumps by" in active.report(third)[1]
 
 
 def test_odometry_of_another_frame_is_refused_and_diagnosed(active: Robot, world: World) -> None:
     for _ in range(10):
-        next(active.stamps_ns)  # a second: too long to go on from what earlier tests have told
+        next(active.stamps_ns)  # a second: too long to go on from the odometry of earlier tests
     first, second = (active.message(world.points(place)) for place in (11, 12))
     drive_between(active, first, second, 0.7, child_frame_id="imu_link")
     active.localize(first)
-    assert "unknown motion (the odometry has stopped" in active.told(second)[1]
+    assert "unknown motion (the odometry has stopped" in active.report(second)[1]
     level, message, values = active.diagnosis("'imu_link'")
     assert level == 1
     assert "odometry on /odom is not used: it is the pose of 'imu_link', not of 'base_link'" in message
     assert values["odometry"] in message
 
 
-def test_tf_tells_where_the_odometrys_frame_lies_but_only_while_localized(active: Robot, world: World) -> None:
-    told: list[TransformStamped] = []
-    subscription = active.node.create_subscription(TransformStamped, "/tf_told", told.append, 100)
-    active.wait_until(lambda: active.node.count_publishers("/tf_told") > 0, what="for TF")
+def test_tf_holds_where_the_odometrys_frame_lies_but_only_while_localized(active: Robot, world: World) -> None:
+    sent: list[TransformStamped] = []
+    subscription = active.node.create_subscription(TransformStamped, "/tf_sent", sent.append, 100)
+    active.wait_until(lambda: active.node.count_publishers("/tf_sent") > 0, what="for TF")
     active.spin(0.3)
     first, second = (active.message(world.points(place)) for place in (14, 15))
     drive_between(active, first, second, 0.9)
@@ -220,8 +220,8 @@ def test_tf_tells_where_the_odometrys_frame_lies_but_only_while_localized(active
     scan = active.message(world.points(15))
     scan.header.stamp = header_message(stamp_ns_of(first) + 55_000_000, "").stamp
     active.localize(scan)
-    active.wait_until(lambda: told, what="for the transform")
-    transform = told[-1]
+    active.wait_until(lambda: sent, what="for the transform")
+    transform = sent[-1]
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
     assert stamp_ns_of(transform) == stamp_ns_of(scan) + 200_000_000
     T_odom_base = np.eye(4)
@@ -230,10 +230,10 @@ def test_tf_tells_where_the_odometrys_frame_lies_but_only_while_localized(active
     position, yaw = pose_in_map(world, 15)
     np.testing.assert_allclose(T_map_base[:3, 3], position, atol=1e-3)
     assert math.atan2(T_map_base[1, 0], T_map_base[0, 0]) == pytest.approx(yaw, abs=1e-6)
-    count = len(told)
+    count = len(sent)
     active.localize(spoil(second, "all NaN"))
     active.spin(0.3)
-    assert len(told) == count
+    assert len(sent) == count
     active.node.destroy_subscription(subscription)
 
 
@@ -251,20 +251,20 @@ def test_an_initial_pose_reaches_the_localizer_in_the_grid(active: Robot, world:
     _, _, values = active.diagnosis_with("initial pose", "taken")
     grid, heading = in_grid(frame_of(world), np.array([12.0, 15.0, 0.0]), 1.0)
     assert f"{grid[0]:.1f} E, {grid[1]:.1f} N" in values["initial pose"]
-    _, message, _ = active.told(active.message(world.points(16)))
+    _, message, _ = active.report(active.message(world.points(16)))
     assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take" in message
-    # TF explains a frame that lies at (100, 50) and is turned by a quarter.
+    # TF explains a frame that lies at (100, 50) and is rotated by a quarter.
     active.guesses.publish(guess("odom_far", -40.0, 90.0, yaw=0.5))
     grid, heading = in_grid(frame_of(world), np.array([10.0, 10.0, 0.0]), 0.5 + math.pi / 2)
     active.diagnosis_with("initial pose", f"{grid[0]:.1f} E, {grid[1]:.1f} N")
-    _, message, _ = active.told(active.message(world.points(16)))
+    _, message, _ = active.report(active.message(world.points(16)))
     assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take 2.999 2.001 0.100" in message, (
         "its north is west"
     )
 
 
 def test_an_initial_pose_that_tf_explains_leaves_the_mounting_of_the_lidar_alone(active: Robot, world: World) -> None:
-    """Where mounting_from_tf is false: TF knows the frame of the clouds too, in another place than the settings."""
+    """Where mounting_from_tf is false: TF has the frame of the clouds too, in another place than the settings."""
     before = best_candidate(active, world, 18)
     active.guesses.publish(guess("odom_far", -40.0, 90.0))
     active.diagnosis_with("initial pose", "taken")
@@ -291,7 +291,7 @@ def test_an_initial_pose_that_nothing_explains_is_refused_with_the_reason(active
     assert active.localize(world.points(16)).status.status == NavSatStatus.STATUS_FIX
 
 
-def test_the_imu_tells_the_heading_until_something_better_does(active: Robot, world: World) -> None:
+def test_the_imu_gives_the_heading_until_something_better_does(active: Robot, world: World) -> None:
     active.call(Empty, "/reinitialize_global_localization", Empty.Request())
     active.localize(active.message(world.points(17)))
 
@@ -303,7 +303,7 @@ def test_the_imu_tells_the_heading_until_something_better_does(active: Robot, wo
         sample.orientation.z, sample.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
         active.imu.publish(sample)
         active.spin(0.2)
-        return active.told(scan)[1]
+        return active.report(scan)[1]
 
     _, heading = in_grid(frame_of(world), np.zeros(3), 0.8)
     assert "prior" not in after(0.8), "it is localized still"
@@ -354,8 +354,8 @@ def test_a_bad_cloud_gives_no_fix_a_reason_and_no_harm(
     assert math.isnan(fix.latitude)
     assert math.isnan(fix.longitude)
     assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN
-    told, message, values = active.diagnosis(reason)
-    assert told == level
+    found, message, values = active.diagnosis(reason)
+    assert found == level
     assert message.startswith(values["last reason"])
     assert not [p for p in active.poses if p.header.stamp == fix.header.stamp], "a pose without a fix"
     assert active.localize(world.points(1)).status.status == NavSatStatus.STATUS_FIX
@@ -378,7 +378,7 @@ def test_real_velodyne_messages_are_read_and_found_nowhere(active: Robot, shared
         publisher.publish(bytes(raw.cdr))
         active.spin(0.3)
         found = [f for f in active.fixes if (f.header.stamp.sec, f.header.stamp.nanosec) == (stamp.sec, stamp.nanosec)]
-    assert found, "no answer to a real cloud"
+    assert found, "no estimate of a real cloud"
     assert found[-1].status.status == NavSatStatus.STATUS_NO_FIX
     points = len(scan_from_pointcloud2(recorded).points)
     active.wait_until(lambda: f"received {points}," in active.diagnosis()[2]["last points"], what="for the count")
@@ -402,7 +402,7 @@ def test_what_is_dropped_is_counted_and_the_newest_is_worked_on(active: Robot, w
     assert processed < len(messages)
 
 
-def test_the_diagnostics_say_what_the_node_works_with(active: Robot, world: World) -> None:
+def test_the_diagnostics_report_what_the_node_works_with(active: Robot, world: World) -> None:
     message = active.message(world.points(2))
     active.localize(message)
     stamps = itertools.count(stamp_ns_of(message), 10_000_000)
@@ -414,7 +414,7 @@ def test_the_diagnostics_say_what_the_node_works_with(active: Robot, world: Worl
     active.wait_until(has_no_complaint, what="for diagnostics without complaint")
     status = active.diagnostics[-1].status[0]
     reason, values = status.message, {v.key: v.value for v in status.values}
-    assert reason.startswith("believed 100%")
+    assert reason.startswith("probability 100%")
     assert values["map"] == str(world.map_path)
     assert values["submaps"] == "30"
     assert len(values["encoder"]) == 16
@@ -486,11 +486,11 @@ def test_a_setting_that_contradicts_another_is_refused_and_the_node_lives(active
 
 
 def test_a_setting_that_changes_keeps_an_initial_pose_and_what_is_known(active: Robot, world: World) -> None:
-    resets = active.told(active.message(world.points(16)))[1].split("resets ")[1].split(",")[0].split(";")[0]
+    resets = active.report(active.message(world.points(16)))[1].split("resets ")[1].split(",")[0].split(";")[0]
     active.guesses.publish(guess("map", 13.0, 14.0, yaw=1.0))
     _, _, values = active.diagnosis_with("initial pose", "taken")
     assert set_parameter(active, "fusion.max_speed_mps", double(11.0)) == (True, "")
-    message = active.told(active.message(world.points(16)))[1]
+    message = active.report(active.message(world.points(16)))[1]
     grid, _ = in_grid(frame_of(world), np.array([13.0, 14.0, 0.0]), 1.0)
     assert f"prior at {grid[0]:.1f} {grid[1]:.1f}" in message
     assert f"resets {resets}" in message
@@ -563,7 +563,7 @@ def test_the_lifecycle_goes_round(active: Robot, world: World) -> None:
     assert active.localize(world.points(6)).status.status == NavSatStatus.STATUS_FIX
 
 
-# A second node, told what to do by a manager, in simulated time, with an IMU and a driver that is reliable.
+# A second node, configured by a manager, in simulated time, with an IMU and a driver that is reliable.
 
 TILT = np.radians(12.0)
 R_TILT = np.array([[np.cos(TILT), 0, np.sin(TILT)], [0, 1, 0], [-np.sin(TILT), 0, np.cos(TILT)]])
@@ -583,7 +583,7 @@ def managed(start_stand_in: StartNode, world: World) -> Iterator[NodeProcess]:
     assert "Traceback" not in node.output
 
 
-def the_scans_tell_how_the_robot_moves(robot: Robot, world: World, clouds: Any) -> None:
+def the_scans_measure_how_the_robot_moves(robot: Robot, world: World, clouds: Any) -> None:
     states: list[DiagnosticStatus] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.node.create_subscription(DiagnosticStatus, "/rover/localizer/state", states.append, latched)
@@ -593,7 +593,7 @@ def the_scans_tell_how_the_robot_moves(robot: Robot, world: World, clouds: Any) 
         message = robot.message(world.points(7) - np.array([forward_m, 0.0, 0.0], np.float32))
         stamp_ns = str(stamp_ns_of(message))
         clouds.publish(message)
-        robot.wait_until(lambda told=stamp_ns: states[-1].values[0].value == told, what="for the state")
+        robot.wait_until(lambda stamp=stamp_ns: states[-1].values[0].value == stamp, what="for the state")
     assert "moved 0.40" in states[-1].message
 
 
@@ -640,12 +640,12 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
 
     with_imu = best_distance(up)
     for _ in range(100):
-        next(robot.stamps_ns)  # ten seconds: the sample is too old then to say anything
+        next(robot.stamps_ns)  # ten seconds: the sample is too old then to be used
     assert with_imu < 0.7 * best_distance(None)
 
-    # An IMU that tells gravity where others tell what holds against it.
-    answers: list[NavSatFix] = []
-    robot.node.create_subscription(NavSatFix, "/rover/localizer/fix", answers.append, 10)
+    # An IMU that reports gravity where others report the force against it.
+    fixes: list[NavSatFix] = []
+    robot.node.create_subscription(NavSatFix, "/rover/localizer/fix", fixes.append, 10)
     robot.wait_until(lambda: robot.node.count_publishers("/rover/localizer/fix"), what="for the fix")
     robot.spin(0.3)
     upside_down = robot.message(tilted)
@@ -654,15 +654,15 @@ def test_a_managed_node_in_a_namespace_levels_by_the_imu(
     imu.publish(sample)
     robot.spin(0.3)
     clouds.publish(upside_down)
-    robot.wait_until(lambda: answers and answers[-1].header.stamp == upside_down.header.stamp, what="for the answer")
-    assert answers[-1].status.status == NavSatStatus.STATUS_NO_FIX
+    robot.wait_until(lambda: fixes and fixes[-1].header.stamp == upside_down.header.stamp, what="for the fix")
+    assert fixes[-1].status.status == NavSatStatus.STATUS_NO_FIX
     assert "points down: at rest it must be +9.8 upwards" in managed.output
     managed.wait_for_output("by the measured gravity the robot lies on its side", 10.0)
 
     if find_spec("kiss_icp") is not None:
-        the_scans_tell_how_the_robot_moves(robot, world, clouds)
+        the_scans_measure_how_the_robot_moves(robot, world, clouds)
 
-    # A driver that is best effort never reaches a reliable subscription, and the node says so.
+    # A driver that is best effort never reaches a reliable subscription, and the node reports it.
     robot.node.create_publisher(PointCloud2, "/rover/lidar", qos_profile_sensor_data)
     managed.wait_for_output("a publisher on /rover/lidar offers an incompatible RELIABILITY", 15.0)
 

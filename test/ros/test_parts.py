@@ -162,7 +162,7 @@ def test_a_worker_that_hangs_is_reported_and_never_works_beside_another(gate: th
     assert "does not end" in worker_complaint(worker.health(), 0.01)
     assert worker_complaint(worker.health(), 60.0) == ""
     assert not worker.stop(timeout_s=0.05)
-    assert not worker.stop(timeout_s=0.0), "and so whoever asks again"
+    assert not worker.stop(timeout_s=0.0), "and so at every further call"
     with pytest.raises(ConfigError, match="does not end: clean the node up"):
         worker.start(lambda: None)
     work.finish(1)
@@ -187,12 +187,12 @@ def test_a_task_that_fails_costs_itself_alone(gate: threading.Event) -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_worker_whose_thread_ends_says_why() -> None:
     def end() -> None:
-        raise SystemExit("told to")
+        raise SystemExit("on purpose")
 
     worker = started()
     worker.post(end)
     wait_until(lambda: not worker.health().is_alive)
-    assert "the thread that localizes has ended (SystemExit: told to)" in worker_complaint(worker.health(), 60.0)
+    assert "the thread that localizes has ended (SystemExit: on purpose)" in worker_complaint(worker.health(), 60.0)
     assert worker.stop()
 
 
@@ -254,21 +254,21 @@ def test_silence_is_explained(
     now = time.monotonic()
     assert health_status(statistics.snapshot(), "/points", publishers, complaint)[0] == DiagnosticStatus.OK
     monkeypatch.setattr("crossloc3d_ros.ros.diagnostics.time.monotonic", lambda: now + 60)
-    told, message = health_status(statistics.snapshot(), "/points", publishers, complaint)
-    assert told == level
+    found, message = health_status(statistics.snapshot(), "/points", publishers, complaint)
+    assert found == level
     assert words in message
 
 
 @pytest.mark.parametrize(("lost", "level"), [(5, DiagnosticStatus.OK), (40, DiagnosticStatus.WARN)])
-def test_clouds_that_get_lost_are_told_even_with_a_fix(lost: int, level: bytes) -> None:
+def test_clouds_that_get_lost_are_reported_even_with_a_fix(lost: int, level: bytes) -> None:
     statistics = Statistics()
     estimate = replace(no_estimate(0, "9 of 25 candidates lie at one place"), status=FixStatus.FIX)
     for _ in range(60):
         statistics.received()
     statistics.processed(Outcome(estimate, is_fault=False), latency_ms=20.0)
     statistics.lost(lost)
-    told, message = health_status(statistics.snapshot(), "/points", 1, "")
-    assert told == level
+    found, message = health_status(statistics.snapshot(), "/points", 1, "")
+    assert found == level
     assert (f"{lost} of {60 + lost} clouds on /points were lost" in message) == (level == DiagnosticStatus.WARN)
 
 
@@ -290,7 +290,7 @@ def test_a_stamp_keeps_every_nanosecond() -> None:
     assert (stamp.sec, stamp.nanosec) == (1_700_000_000, 123_456_789)
 
 
-def test_a_transform_is_the_mounting_that_it_says() -> None:
+def test_a_transform_is_the_mounting_that_it_holds() -> None:
     mounting = MountingConfig(x_m=0.3, y_m=-0.2, z_m=1.4, yaw_deg=90.0)
     half = np.sqrt(0.5)
     transform = Transform(translation=Vector3(x=0.3, y=-0.2, z=1.4), rotation=Quaternion(x=0.0, y=0.0, z=half, w=half))

@@ -96,7 +96,7 @@ def listen(seconds: float, scans: int) -> subprocess.Popen[str]:
     )
 
 
-def heard_by(process: subprocess.Popen[str]) -> dict[str, list]:
+def received_by(process: subprocess.Popen[str]) -> dict[str, list]:
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     return json.loads(output)
@@ -118,23 +118,23 @@ def test_every_cloud_arrives_unchanged_on_time_with_the_clock(tmp_path: Path, ow
     path = write_drive(tmp_path / "drive")
     listener = listen(30, SCANS)
     player = player_process(path, "play_bag(reader, PlayerConfig(clock=True))")
-    heard = heard_by(listener)
+    received = received_by(listener)
     output, errors = player.communicate(timeout=30)
     assert player.returncode == 0, errors
     messages, late_median_ms, _, duration_s = (float(v) for v in output.split())
     assert messages == SCANS + 1
     # 660 KB each, best effort as recorded: without the shared-memory profile most would be lost.
-    assert heard["cloud_publishers"] == ["2"] or "BEST_EFFORT" in heard["cloud_publishers"][0]
-    assert heard["stamps_ns"] == [START_NS + i * STEP_NS for i in range(SCANS)]
-    assert heard["digests"] == [digest_of(cloud_of(i, 30_000)) for i in range(SCANS)]
-    assert heard["fixes"] == [52.5]
+    assert received["cloud_publishers"] == ["2"] or "BEST_EFFORT" in received["cloud_publishers"][0]
+    assert received["stamps_ns"] == [START_NS + i * STEP_NS for i in range(SCANS)]
+    assert received["digests"] == [digest_of(cloud_of(i, 30_000)) for i in range(SCANS)]
+    assert received["fixes"] == [52.5]
     # Deadlines are absolute: over the whole drive the timing neither stretches nor shrinks.
-    arrived = np.array(heard["arrived_ns"])
+    arrived = np.array(received["arrived_ns"])
     assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx((SCANS - 1) * STEP_NS / 1e9, abs=0.3)
     assert duration_s == pytest.approx((SCANS - 1) * STEP_NS / 1e9, abs=0.6)
     assert late_median_ms < 30.0  # 0.2 ms on a machine with nothing else to do
     # The clock stands at the start while the player waits, then runs at 40 Hz or more and never goes back.
-    clocks = np.array(heard["clocks"])
+    clocks = np.array(received["clocks"])
     assert clocks[0] < START_NS + 10 * STEP_NS
     assert (np.diff(clocks) >= 0).all()
     running = clocks[clocks > START_NS]
@@ -148,12 +148,12 @@ def test_a_real_recording_at_four_times_its_speed(own_domain: None, shared) -> N
         recorded = [(t_ns, bag.stamp_ns_of(m, 0), digest_of(m)) for _, t_ns, m in reader.messages()]
     listener = listen(30, len(recorded))
     player = player_process(path, "play_bag(reader, PlayerConfig(rate=4.0))")
-    heard = heard_by(listener)
+    received = received_by(listener)
     _, errors = player.communicate(timeout=30)
     assert player.returncode == 0, errors
-    assert heard["stamps_ns"] == [stamp_ns for _, stamp_ns, _ in recorded]
-    assert heard["digests"] == [digest for _, _, digest in recorded]
-    arrived = np.array(heard["arrived_ns"])
+    assert received["stamps_ns"] == [stamp_ns for _, stamp_ns, _ in recorded]
+    assert received["digests"] == [digest for _, _, digest in recorded]
+    arrived = np.array(received["arrived_ns"])
     seconds = (recorded[-1][0] - recorded[0][0]) / 1e9
     assert (arrived[-1] - arrived[0]) / 1e9 == pytest.approx(seconds / 4, abs=0.2)
 
@@ -174,14 +174,14 @@ def test_a_ros_1_bag_under_another_topic(tmp_path: Path, own_domain: None) -> No
     player = player_process(
         path, "play_bag(reader, PlayerConfig(), ros_arguments=['-r', '/points_raw:=/velodyne_points'])"
     )
-    heard = heard_by(listener)
+    received = received_by(listener)
     _, errors = player.communicate(timeout=30)
     assert player.returncode == 0, errors
-    assert heard["stamps_ns"] == [START_NS + i * STEP_NS for i in range(len(clouds))]
-    assert heard["digests"] == [digest_of(cloud) for cloud in clouds]
+    assert received["stamps_ns"] == [START_NS + i * STEP_NS for i in range(len(clouds))]
+    assert received["digests"] == [digest_of(cloud) for cloud in clouds]
 
 
-def test_nobody_listening_is_said(tmp_path: Path, own_domain: None) -> None:
+def test_no_subscriber_is_reported(tmp_path: Path, own_domain: None) -> None:
     path = write_drive(tmp_path / "drive", scans=2, points=10)
     player = player_process(path, "play_bag(reader, PlayerConfig(wait_s=0.5))")
     _, errors = player.communicate(timeout=30)
@@ -231,7 +231,7 @@ def test_offered_qos_is_the_recorded_one_and_reliable_where_unknown() -> None:
     assert qos_of(BagTopic("/t", "m", 1)).reliability == ReliabilityPolicy.RELIABLE
 
 
-def test_what_cannot_be_played_is_said(tmp_path: Path, own_domain: None) -> None:
+def test_what_cannot_be_played_is_reported(tmp_path: Path, own_domain: None) -> None:
     import rclpy
     from rclpy.node import Node
 

@@ -1,4 +1,4 @@
-"""What messages tell of poses, and what is told of them: frames, covariances, refusals, waiting."""
+"""Poses from messages and to messages: frames, covariances, refusals, waiting."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ def test_an_initial_pose_is_the_same_in_whatever_frame_it_is_given(x: float, y: 
     plain = initial_pose(pose_message(T_map_base, covariance), STAMP_NS, np.eye(4), FRAME, BOUNDS)
     T_map_earth = np.linalg.inv(FRAME.pose_on_earth)
     R = np.kron(np.eye(2), T_map_earth[:3, :3])
-    turned = pose_message(FRAME.pose_on_earth @ T_map_base, R.T @ covariance @ R)
-    other = initial_pose(turned, STAMP_NS, T_map_earth, FRAME, BOUNDS)
+    rotated = pose_message(FRAME.pose_on_earth @ T_map_base, R.T @ covariance @ R)
+    other = initial_pose(rotated, STAMP_NS, T_map_earth, FRAME, BOUNDS)
     for prior in (plain, other):
         grid, heading = in_grid(FRAME, T_map_base[:3, 3], yaw)
         assert prior.grid is not None
@@ -109,7 +109,7 @@ def test_an_initial_pose_is_the_same_in_whatever_frame_it_is_given(x: float, y: 
     assert plain.covariance[2, 2] == pytest.approx(covariance[5, 5])
 
 
-def test_an_initial_pose_says_what_it_does_not_know() -> None:
+def test_an_initial_pose_marks_what_it_does_not_know() -> None:
     known = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 
     def prior(covariance: np.ndarray) -> Any:
@@ -124,7 +124,7 @@ def test_an_initial_pose_says_what_it_does_not_know() -> None:
     no_place[0, 0] = no_place[1, 1] = np.inf
     assert prior(no_place).grid is None
     assert prior(no_place).covariance[2, 2] == pytest.approx(0.01)
-    # Zeros mean that nobody has filled them in, and nobody knows better than this.
+    # Zeros mean that they were not filled in, and no better value is known.
     assert math.sqrt(prior(np.zeros((6, 6))).covariance[0, 0]) == pytest.approx(2.0)
     assert math.sqrt(prior(known * 1e-9).covariance[0, 0]) == pytest.approx(0.1, rel=0.01)
 
@@ -161,22 +161,22 @@ def test_an_initial_pose_that_is_not_a_number_is_refused() -> None:
 
 
 def imu_message(R_world_imu: Rotation, R_ned: np.ndarray | None = None) -> Imu:
-    """An IMU at rest: its orientation in ENU, or in the frame that `R_ned` turns ENU into."""
+    """An IMU at rest: its orientation in ENU, or in the frame that `R_ned` rotates ENU to."""
     message = Imu(header=header_message(STAMP_NS, "imu"))
     force = R_world_imu.inv().apply([0.0, 0.0, 9.81])
     message.linear_acceleration.x, message.linear_acceleration.y, message.linear_acceleration.z = map(float, force)
-    told = R_world_imu if R_ned is None else Rotation.from_matrix(R_ned) * R_world_imu
+    orientation = R_world_imu if R_ned is None else Rotation.from_matrix(R_ned) * R_world_imu
     q = message.orientation
-    q.x, q.y, q.z, q.w = (float(v) for v in told.as_quat())
+    q.x, q.y, q.z, q.w = (float(v) for v in orientation.as_quat())
     return message
 
 
 @given(angles, st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), angles, st.floats(-180, 180))
 def test_the_heading_is_that_of_the_base_in_the_grid(
-    yaw: float, pitch: float, roll: float, turned: float, offset_deg: float
+    yaw: float, pitch: float, roll: float, rotated: float, offset_deg: float
 ) -> None:
     R_world_base = Rotation.from_euler("ZYX", [yaw, pitch, roll])
-    R_base_imu = Rotation.from_euler("ZYX", [turned, 0.1, 3.0])  # mounted upside down and aslant
+    R_base_imu = Rotation.from_euler("ZYX", [rotated, 0.1, 3.0])  # mounted upside down and aslant
     message = imu_message(R_world_base * R_base_imu)
     offset_rad = math.radians(offset_deg)
     prior = heading_prior(message, R_base_imu.as_matrix(), FRAME, math.radians(15.0), offset_rad)
@@ -293,13 +293,13 @@ def test_odometry_of_another_frame_is_brought_to_the_base_where_tf_relates_them(
         (OdometryState(9, 0.1, "it is upside down"), 1, "is not used: it is upside down"),
     ],
 )
-def test_what_is_wrong_with_the_odometry_is_told(state: OdometryState, publishers: int, words: str) -> None:
+def test_what_is_wrong_with_the_odometry_is_reported(state: OdometryState, publishers: int, words: str) -> None:
     complaint = odometry_complaint(state, "/odom", publishers)
     assert words in complaint
     assert bool(complaint) == bool(words)
 
 
-# What is told
+# Messages of poses
 
 
 def test_every_message_can_be_made_of_an_estimate_that_knows_nothing() -> None:

@@ -81,15 +81,15 @@ def validation_town(seed: int, config: PreprocessingConfig, queries: int = 12) -
     cutter = SubmapCutter(points.astype(np.float64), config)
     centres = submap_centres((50.0, 50.0, SIZE_M - 50.0, SIZE_M - 50.0), 38.0)
     cut = [(c, patch.points) for c in centres if (patch := cutter.cut(c)) is not None]
-    asked = []
+    seen = []
     for place in rng.uniform(55, SIZE_M - 55, (queries, 2)):
         patch = make_patch(scan_of(points, place, rng, rng.uniform(0, 2 * np.pi)), config.scan_half_extent_m, config)
         if patch is not None:
-            asked.append((place, patch.points))
+            seen.append((place, patch.points))
     return ValidationTown(
         f"town{seed}",
-        np.array([a for a, _ in asked]),
-        np.array([p for _, p in asked]),
+        np.array([a for a, _ in seen]),
+        np.array([p for _, p in seen]),
         np.array([c for c, _ in cut]),
         np.array([p for _, p in cut]),
     )

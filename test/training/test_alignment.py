@@ -56,7 +56,7 @@ def drawn(share: float, temperature: float, count: int, seed: int) -> list[Score
 
 
 @pytest.mark.parametrize(("share", "temperature"), [(0.5, 12.0), (0.35, 25.0)])
-def test_the_calibration_that_made_the_answers_is_found(share: float, temperature: float) -> None:
+def test_the_calibration_that_made_the_scores_is_found(share: float, temperature: float) -> None:
     detection_probability, found_temperature = calibrate(drawn(share, temperature, 600, 1))
     assert detection_probability == pytest.approx(share, abs=0.03)
     assert found_temperature == pytest.approx(temperature, rel=0.2)
@@ -64,18 +64,18 @@ def test_the_calibration_that_made_the_answers_is_found(share: float, temperatur
 
 def test_probabilities_after_the_calibration_are_shares_of_what_is_right() -> None:
     share, temperature = calibrate(drawn(0.5, 15.0, 600, 2))
-    believed, right = [], []
-    for answer in drawn(0.5, 15.0, 1000, 3):
-        log_odds = (answer.scores - share * answer.expected) / temperature + answer.log_prior
-        believed.append(math.exp(log_odds[0] - np.logaddexp(0.0, np.logaddexp.reduce(log_odds))))
-        right.append(answer.right == 0)
+    predicted, right = [], []
+    for poses in drawn(0.5, 15.0, 1000, 3):
+        log_odds = (poses.scores - share * poses.expected) / temperature + poses.log_prior
+        predicted.append(math.exp(log_odds[0] - np.logaddexp(0.0, np.logaddexp.reduce(log_odds))))
+        right.append(poses.right == 0)
     for low, high in ((0.05, 0.35), (0.35, 0.65), (0.65, 0.95)):
-        here = (np.array(believed) >= low) & (np.array(believed) < high)
+        here = (np.array(predicted) >= low) & (np.array(predicted) < high)
         assert here.sum() > 30
-        assert np.mean(np.array(right)[here]) == pytest.approx(np.mean(np.array(believed)[here]), abs=0.12)
+        assert np.mean(np.array(right)[here]) == pytest.approx(np.mean(np.array(predicted)[here]), abs=0.12)
 
 
-def test_answers_without_any_pose_do_no_harm() -> None:
+def test_scans_without_any_pose_do_no_harm() -> None:
     scored = drawn(0.5, 12.0, 100, 4)
     nothing = ScoredPoses(np.empty(0), 300.0, None, -7.0)
     np.testing.assert_allclose(calibrate([*scored, nothing]), calibrate(scored), rtol=1e-3)
@@ -98,30 +98,30 @@ def test_a_pose_is_right_within_two_metres_and_five_degrees(pose_set: PoseSet) -
     assert is_right(no_aligned_poses(), scan).shape == (0,)
 
 
-def test_what_is_learned_is_whole_and_tells_walls_from_streets(learned: Learned, tmp_path: Path) -> None:
+def test_what_is_learned_is_whole_and_separates_walls_from_streets(learned: Learned, tmp_path: Path) -> None:
     model, scored = learned
     assert model.log_ratios.shape == (CHANNELS, CLASSES)
     assert np.isfinite(model.log_ratios).all()
     assert (model.log_ratios[:, UNKNOWN] == 0.0).all()
-    assert (model.expected > 0.0).all(), "at true poses every channel speaks for them"
+    assert (model.expected > 0.0).all(), "at true poses every channel supports them"
     assert 0.0 < model.expected_share < 1.0
     assert model.temperature > 0.0
     assert (model.log_ratios[:LAYERS, 0] < 0.0).all(), "no returns from an empty street"
     model.save(tmp_path / "learned.safetensors")
     np.testing.assert_array_equal(ObservationModel.load(tmp_path / "learned.safetensors").log_ratios, model.log_ratios)
-    assert sum(answer.right is not None for answer in scored) >= 6
+    assert sum(poses.right is not None for poses in scored) >= 6
 
 
-def test_answers_are_scores_before_any_calibration(pose_set: PoseSet, learned: Learned) -> None:
+def test_log_likelihoods_are_scores_before_any_calibration(pose_set: PoseSet, learned: Learned) -> None:
     on_map = [bool(pose_set.on_map[scan.area]) for scan in pose_set.scans]
     _, scored = learned
     assert len(scored) == len(on_map)
-    for answer, on in zip(scored, on_map, strict=True):
-        assert on or answer.right is None, "nothing is right off the map"
-        assert answer.expected > 0.0
-        assert (np.diff(answer.scores) <= 1e-9).all()
-        assert answer.log_prior < 0.0
-    right = [answer.scores[answer.right] / answer.expected for answer in scored if answer.right is not None]
+    for poses, on in zip(scored, on_map, strict=True):
+        assert on or poses.right is None, "nothing is right off the map"
+        assert poses.expected > 0.0
+        assert (np.diff(poses.scores) <= 1e-9).all()
+        assert poses.log_prior < 0.0
+    right = [poses.scores[poses.right] / poses.expected for poses in scored if poses.right is not None]
     assert 0.5 < np.median(right) < 1.5, "the true pose scores what is expected of it"
 
 
@@ -136,7 +136,7 @@ def test_a_learned_model_finds_its_scans_and_doubts_the_others(pose_set: PoseSet
             assert found.probabilities.sum() < 0.5
 
 
-def test_it_tells_how_far_it_is(pose_set: PoseSet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_reported(pose_set: PoseSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "crossloc3d_ros.training.alignment._scored_poses", lambda *_: ScoredPoses(np.array([9.0]), 10.0, 0, -5.0)
     )

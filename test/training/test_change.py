@@ -19,7 +19,7 @@ def test_nothing_changes_by_default(place: Float32Array) -> None:
     assert np.array_equal(change(place, 50.0, np.random.default_rng(1), TrainConfig()), place)
 
 
-def test_as_many_points_stay_as_the_setting_says(place: Float32Array) -> None:
+def test_as_many_points_stay_as_set(place: Float32Array) -> None:
     config = TrainConfig(keep_survey=0.3)
     shares = [len(change(place, 50.0, np.random.default_rng(seed), config)) / len(place) for seed in range(40)]
     assert 0.28 < min(shares) < 0.45 and 0.85 < max(shares) <= 1.0
@@ -37,7 +37,7 @@ def test_things_go_and_others_come(place: Float32Array) -> None:
     assert min(point[2] for point in come) >= 0.0
 
 
-def test_displacement_is_of_the_size_asked_for_and_of_the_seed(place: Float32Array) -> None:
+def test_displacement_is_of_the_configured_size_and_of_the_seed(place: Float32Array) -> None:
     config = TrainConfig(displacement_m=0.2)
     moved = [change(place, 50.0, np.random.default_rng(seed), config) - place for seed in range(20)]
     assert 0.05 < np.mean([np.std(offsets[:, 0]) for offsets in moved]) < 0.2

@@ -1,4 +1,4 @@
-"""Tables of comparison: rows differ in one thing alone, go on after a stop, and say what they measured."""
+"""Tables of comparison: rows differ in one thing alone, go on after a stop, and hold what they measured."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def examined(made_places: Path) -> EvaluationSet:
+def evaluation_set(made_places: Path) -> EvaluationSet:
     """Give the held-out town as a benchmark."""
     town = read_validation_town(made_places / "validation_1000.npz")
     queries, aerial = len(town.query_xy_m), len(town.submap_xy_m)
@@ -114,14 +114,14 @@ def test_rows_are_chosen_by_name(tiny: TrainConfig) -> None:
 
 @pytest.fixture(scope="module")
 def done(
-    made_places: Path, finished_run: Path, examined: EvaluationSet, tmp_path_factory: pytest.TempPathFactory
+    made_places: Path, finished_run: Path, evaluation_set: EvaluationSet, tmp_path_factory: pytest.TempPathFactory
 ) -> Comparison:
     """Give a small table that is done."""
     base = read_config(finished_run)  # the settings of `tiny`
     folder = tmp_path_factory.mktemp("compared")
     rows = select(rows_of("competitors", base), ["height_maps", "minkloc3d_coarser", "crossloc3d"])
     subject = Comparison(
-        rows, [made_places], folder / "table", Budget(steps=2), examined, base.preprocessing, folder / "cache"
+        rows, [made_places], folder / "table", Budget(steps=2), evaluation_set, base.preprocessing, folder / "cache"
     )
     subject.run()
     return subject
@@ -133,12 +133,12 @@ def table(done: Comparison, tmp_path: Path) -> Comparison:
     return dataclasses.replace(done, folder=shutil.copytree(done.folder, tmp_path / "table"))
 
 
-def test_a_table_holds_what_was_measured(done: Comparison, examined: EvaluationSet) -> None:
+def test_a_table_holds_what_was_measured(done: Comparison, evaluation_set: EvaluationSet) -> None:
     results = {result.slug: result for result in done.results()}
     assert list(results) == ["height_maps", "minkloc3d_coarser", "crossloc3d"]
     for row in done.rows:
         result, folder = results[row.slug], done.folder / row.slug
-        figures = score(load_predictions(folder / "predictions.npz"), examined).overall
+        figures = score(load_predictions(folder / "predictions.npz"), evaluation_set).overall
         for recall in result.recalls:
             assert recall == figures.recall(f"R@{recall.rank}", recall.radius_m)
         assert result.one_thread_ms > 0
@@ -171,7 +171,7 @@ def test_a_table_that_is_done_stays_as_it_is(table: Comparison, monkeypatch: pyt
     assert {path: path.read_bytes() for path in table.folder.rglob("*") if path.is_file()} == before
 
 
-def test_what_was_stopped_before_its_examination_is_examined(
+def test_what_was_stopped_before_its_evaluation_is_evaluated(
     table: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = table.results()
@@ -199,9 +199,9 @@ def test_a_larger_budget_goes_on_with_the_runs(table: Comparison) -> None:
     assert before.encoder != after.encoder
 
 
-def test_results_of_another_benchmark_do_not_count(table: Comparison, examined: EvaluationSet) -> None:
-    moved = dataclasses.replace(examined.queries, xy_m=examined.queries.xy_m + 1.0)
-    other = dataclasses.replace(table, evaluation_set=dataclasses.replace(examined, queries=moved))
+def test_results_of_another_benchmark_do_not_count(table: Comparison, evaluation_set: EvaluationSet) -> None:
+    moved = dataclasses.replace(evaluation_set.queries, xy_m=evaluation_set.queries.xy_m + 1.0)
+    other = dataclasses.replace(table, evaluation_set=dataclasses.replace(evaluation_set, queries=moved))
     assert other.results() == []
 
 
@@ -280,11 +280,11 @@ def test_the_command_lists_rows(capsys: pytest.CaptureFixture[str]) -> None:
         (["--places", "somewhere", "--budget-steps", "2", "--config", "nowhere.yaml"], "cannot read nowhere.yaml"),
     ],
 )
-def test_what_is_missing_is_said_in_one_line(
-    arguments: list[str], message: str, examined: EvaluationSet, monkeypatch: pytest.MonkeyPatch,
+def test_what_is_missing_is_reported_in_one_line(
+    arguments: list[str], message: str, evaluation_set: EvaluationSet, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(compare, "open_benchmark", lambda *_, **__: examined)
+    monkeypatch.setattr(compare, "open_benchmark", lambda *_, **__: evaluation_set)
     assert compare.main(["--table", "refinement", *arguments]) == 2
     errors = capsys.readouterr().err.strip().splitlines()
     assert len(errors) == 1
@@ -292,12 +292,13 @@ def test_what_is_missing_is_said_in_one_line(
 
 
 def test_the_command_writes_the_table(
-    examined: EvaluationSet, tiny: TrainConfig, made_places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    evaluation_set: EvaluationSet, tiny: TrainConfig, made_places: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     import yaml
 
-    monkeypatch.setattr(compare, "open_benchmark", lambda *_, **__: examined)
+    monkeypatch.setattr(compare, "open_benchmark", lambda *_, **__: evaluation_set)
     settings = tmp_path / "settings.yaml"
     settings.write_text(yaml.safe_dump({"train": _plain(to_dict(tiny))}))
     arguments = [

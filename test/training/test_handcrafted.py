@@ -25,7 +25,7 @@ def place(seed: int, points: int = 1500) -> Float32Array:
     return np.column_stack((xy, rng.uniform(0.01, 1.0, points) * height[owner])).astype(np.float32)
 
 
-def turned(points: Float32Array, angle_rad: float) -> Float32Array:
+def rotated(points: Float32Array, angle_rad: float) -> Float32Array:
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return (points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).astype(np.float32)
 
@@ -63,12 +63,12 @@ def test_the_published_distance_is_the_least_over_plain_shifts() -> None:
 
 
 @pytest.mark.parametrize("method", [context(), HeightMaps(config=HeightMapConfig(sectors=24))], ids=["context", "maps"])
-def test_a_turned_scan_is_found_and_its_heading_told(method: ScanContext | HeightMaps) -> None:
+def test_a_rotated_scan_is_found_with_its_heading(method: ScanContext | HeightMaps) -> None:
     places = [place(seed) for seed in range(12)]
     database = method.encode_batch(places)
     for row, step in ((3, 5), (7, 17), (10, 0)):
         heading = step * math.pi / 12  # whole sectors of 15 degrees
-        distances, headings, *_ = method.compare(method.encode_batch([turned(places[row], -heading)]), database)
+        distances, headings, *_ = method.compare(method.encode_batch([rotated(places[row], -heading)]), database)
         assert distances[0].argmin() == row
         assert headings[0, row] == pytest.approx(heading)
 

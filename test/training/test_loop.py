@@ -206,7 +206,7 @@ def test_the_learning_rate_rises_then_falls_to_its_last_share(tiny: TrainConfig)
     assert rates[-1] == pytest.approx(tiny.final_share * tiny.learning_rate)
 
 
-def test_until_the_cooldown_the_learning_rate_does_not_ask_how_long_the_run_will_be(tiny: TrainConfig) -> None:
+def test_until_the_cooldown_the_learning_rate_does_not_depend_on_how_long_the_run_will_be(tiny: TrainConfig) -> None:
     config = dataclasses.replace(tiny, warm_up=0.0, cooldown=0.25)
     short, long = Budget(minutes=100.0), Budget(minutes=1000.0)
     for minute in range(0, 75, 5):

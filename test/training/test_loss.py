@@ -102,11 +102,11 @@ def test_at_a_low_temperature_the_smooth_average_precision_is_the_exact_one() ->
     matches = torch.from_numpy(rng.random((12, 12)) < 0.2) | own(12)
     ignored = torch.from_numpy(rng.random((12, 12)) < 0.2) & ~matches
     distances = torch.cdist(scans, submaps).numpy()
-    asked = []
+    expected = []
     for d, m, c in ((distances, matches, ~ignored), (distances.T, matches.T, ~ignored.T)):
-        asked += [exact_average_precision(d[q], m[q].numpy(), c[q].numpy()) for q in range(12)]
+        expected += [exact_average_precision(d[q], m[q].numpy(), c[q].numpy()) for q in range(12)]
     loss = TruncatedSmoothAP(1e-5, positives=12)(scans, submaps, ignored, matches)
-    assert float(loss) == pytest.approx(1.0 - np.mean(asked), abs=1e-3)
+    assert float(loss) == pytest.approx(1.0 - np.mean(expected), abs=1e-3)
 
 
 def test_truncation_counts_the_nearest_matches_alone() -> None:
@@ -135,7 +135,7 @@ def test_following_its_gradient_ranks_the_right_submaps_first() -> None:
     assert (torch.cdist(scans, submaps).argmin(1) == torch.arange(20)).float().mean() > 0.9
 
 
-def test_the_share_of_active_triplets_is_told() -> None:
+def test_the_share_of_active_triplets_is_reported() -> None:
     criterion = BatchHardTriplet(0.1)
     apart = 100.0 * torch.eye(6, 8)
     criterion(apart, apart, nothing_ignored(), own())

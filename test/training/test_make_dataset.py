@@ -202,7 +202,7 @@ def test_other_areas_keep_what_was_read(recorded_area, tmp_path: Path, monkeypat
         load_validation(output, None, TrainConfig(preprocessing=PATCH))
 
 
-def test_a_disk_with_too_little_room_is_told_before_the_writing(
+def test_a_disk_with_too_little_room_is_reported_before_the_writing(
     recorded_area, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # type: ignore[no-untyped-def]
     usage = shutil.disk_usage(tmp_path)
@@ -305,7 +305,7 @@ def test_a_simulated_drive_through_a_simulated_town_becomes_a_dataset(tmp_path: 
     loaded = load_evaluation_set(tmp_path / "own", patch)
     truth = mounting_matrix(mounting)
     assert truth[2, 3] == 1.1
-    # Where the drive says that a scan was taken, the survey shows what the scan shows.
+    # At the pose that the drive gives a scan, the survey shows what the scan shows.
     heights = []
     for i in range(len(loaded.queries)):
         nearest = int(np.hypot(*(loaded.aerial.xy_m - loaded.queries.xy_m[i]).T).argmin())

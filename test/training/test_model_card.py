@@ -1,4 +1,4 @@
-"""The card says what was done, from the files alone; the page shows how it went."""
+"""The card reports what was done, from the files alone; the page shows how it went."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_results_of_other_weights_or_of_nothing_are_refused(
     assert (shipped.parent / run_folder.MODEL_CARD).read_text() == before
 
 
-def test_a_measure_that_nobody_could_count_is_said(
+def test_a_measure_that_could_not_be_counted_is_reported(
     finished: Path, shipped: Path, evaluated: Callable[..., Path]
 ) -> None:
     results = evaluated(load_checkpoint(shipped).fingerprint, None)
@@ -93,15 +93,15 @@ def test_a_measure_that_nobody_could_count_is_said(
 
 
 def test_the_card_of_exported_weights_shows_their_own_validation(finished: Path, shipped: Path) -> None:
-    examined = json.loads(load_checkpoint(shipped).metadata["examined"])
+    exported = json.loads(load_checkpoint(shipped).metadata["examined"])
     card = (shipped.parent / run_folder.MODEL_CARD).read_text()
-    best = next(r for r in examined["recalls"] if (r["label"], r["radius_m"]) == ("R@1", 100.0))
+    best = next(r for r in exported["recalls"] if (r["label"], r["radius_m"]) == ("R@1", 100.0))
     interval = f"{100 * best['value']:.1f} % [{100 * best['low']:.1f}, {100 * best['high']:.1f}]"
     assert f"| 100 m | R@1 | {interval} |" in card
     assert "from scratch" in card and "Previous weights" not in card
 
 
-def test_the_card_tells_what_came_before_and_how_it_was_learned(
+def test_the_card_reports_what_came_before_and_how_it_was_learned(
     finished: Path, places: Path, tmp_path: Path, tiny: TrainConfig
 ) -> None:
     config = dataclasses.replace(
@@ -129,7 +129,7 @@ def test_the_page_shows_the_run(finished: Path, tmp_path: Path) -> None:
     assert (tmp_path / "page.html").read_text() == page
 
 
-def test_a_run_without_anything_to_draw_is_said(finished: Path) -> None:
+def test_a_run_without_anything_to_draw_is_reported(finished: Path) -> None:
     (finished / run_folder.LOG).write_text("")
     with pytest.raises(TrainingError, match="not logged a step"):
         write_curve(finished)

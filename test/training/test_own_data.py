@@ -74,10 +74,10 @@ def dataset(tmp_path: Path) -> Callable[..., Path]:
         write_info(tmp_path, {"points": 64, "half_extent_m": 20.0, "scan_half_extent_m": 20.0})
         write_training(tmp_path / PLAIN.training, both, iter(pairs))
         count = SCANS if validation else 0
-        held, asked = aerial.rows(numbers < count), ground.rows(numbers < count)
+        held, queries = aerial.rows(numbers < count), ground.rows(numbers < count)
         write_database(tmp_path / "umd_validation_database.pickle", [held, held])
         right = tuple({0: np.array([i]), 1: np.array([i])} for i in range(count))
-        write_queries(tmp_path / "umd_validation_query.pickle", [QueryTable(asked, right)])
+        write_queries(tmp_path / "umd_validation_query.pickle", [QueryTable(queries, right)])
         return tmp_path
 
     return write
@@ -183,8 +183,8 @@ def test_hard_places_are_part_of_a_batch(dataset: Callable[..., Path]) -> None:
 def test_the_papers_augmentation_keeps_headings(dataset: Callable[..., Path]) -> None:
     batch = load_training(dataset(headings=False), None, dataclasses.replace(CONFIG, augmentation="paper")).batch(1)
     assert len(batch.scans) == 8
-    turned = np.abs(np.sin(bearings(batch.submaps)))
-    assert turned.max() < math.sin(math.radians(5.0)) + 0.1
+    rotated = np.abs(np.sin(bearings(batch.submaps)))
+    assert rotated.max() < math.sin(math.radians(5.0)) + 0.1
 
 
 def test_a_training_area_without_positives_is_named(dataset: Callable[..., Path]) -> None:
@@ -195,7 +195,7 @@ def test_a_training_area_without_positives_is_named(dataset: Callable[..., Path]
         load_training(dataset(positives=False), None, CONFIG)
 
 
-def test_clouds_too_poor_for_patches_are_told(dataset: Callable[..., Path]) -> None:
+def test_clouds_too_poor_for_patches_are_reported(dataset: Callable[..., Path]) -> None:
     folder = dataset()
     config = dataclasses.replace(
         CONFIG, preprocessing=dataclasses.replace(PATCH, half_extent_m=21.0, min_points=65, thin_m=0.0)

@@ -57,7 +57,7 @@ def test_a_seed_makes_the_same_town_again(made: Path) -> None:
 
 
 def test_scan_and_survey_show_the_same_things(made: Path) -> None:
-    """Turned to its heading, a scan lies on the survey: the frames and signs of both are the same."""
+    """Rotated to its heading, a scan lies on the survey: the frames and signs of both are the same."""
     entry = read_manifest(made).of_role("train")[0]
     town = read_training_town(made / entry.file)
     field = PointField(town.survey_points)

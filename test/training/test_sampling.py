@@ -18,7 +18,7 @@ from crossloc3d_ros.training.sampling import BatchSampler, HardPlaces, PointFiel
 from crossloc3d_ros.training.shards import TrainingTown
 
 
-def test_a_step_has_one_batch_whoever_asks(make_training_town: Callable[..., TrainingTown], tiny: TrainConfig) -> None:
+def test_a_step_has_one_batch_whoever_calls(make_training_town: Callable[..., TrainingTown], tiny: TrainConfig) -> None:
     towns = [make_training_town(seed) for seed in range(3)]
     first, second = BatchSampler(towns, tiny), BatchSampler(towns, tiny)
     first.batch(1)
@@ -45,11 +45,11 @@ def test_patches_stay_in_their_cube(make_training_town: Callable[..., TrainingTo
         assert patch.shape == (tiny.preprocessing.n_points, 3) and patch.dtype == np.float32
         assert patch[:, 2].min() > 0.0 and patch[:, 2].max() <= 1.0
     assert max(np.abs(patch).max() for patch in batch.submaps) <= 1.0
-    # A scan's patch is turned as a query's is: its corners leave the cube.
+    # A scan's patch is rotated as a query's is: its corners leave the cube.
     assert max(np.hypot(patch[:, 0], patch[:, 1]).max() for patch in batch.scans) <= np.sqrt(2.0) + 1e-6
 
 
-def test_a_cut_without_turn_is_the_map_builder_s(
+def test_a_cut_without_rotation_is_the_map_builder_s(
     make_training_town: Callable[..., TrainingTown], tiny: TrainConfig
 ) -> None:
     town = make_training_town(4)
@@ -63,7 +63,7 @@ def test_a_cut_without_turn_is_the_map_builder_s(
     assert abs(len(np.unique(np.round(cut, 2), axis=0)) - len(expected)) <= 2
 
 
-def test_a_turned_cut_holds_the_turned_square(make_training_town: Callable[..., TrainingTown]) -> None:
+def test_a_rotated_cut_holds_the_rotated_square(make_training_town: Callable[..., TrainingTown]) -> None:
     points = make_training_town(5).survey_points
     centre, heading, half = np.array([120.0, 80.0]), 0.7, 30.0
     cut = PointField(points).cut(centre, heading, half)
@@ -80,7 +80,7 @@ def test_a_field_beyond_the_survey_is_empty(make_training_town: Callable[..., Tr
     assert field.cut(np.array([5000.0, 5000.0]), 0.3, 50.0).shape == (0, 3)
 
 
-def test_nothing_to_learn_from_is_said(make_training_town: Callable[..., TrainingTown], tiny: TrainConfig) -> None:
+def test_nothing_to_learn_from_is_reported(make_training_town: Callable[..., TrainingTown], tiny: TrainConfig) -> None:
     with pytest.raises(TrainingError, match="no scan to learn from"):
         BatchSampler([], tiny)
     without_positives = dataclasses.replace(make_training_town(0), survey_points=np.zeros((1, 3), np.float32))
@@ -127,12 +127,12 @@ def test_a_cloud_of_the_paper_s_loses_at_most_a_cuboid_and_a_tenth() -> None:
     assert 0.008 < shifts.std() < 0.016  # the translation, and a little from the choice of points
 
 
-def test_a_batch_of_the_paper_s_is_turned_by_five_degrees_and_mirrored_at_times() -> None:
+def test_a_batch_of_the_paper_s_is_rotated_by_five_degrees_and_mirrored_at_times() -> None:
     rng = np.random.default_rng(1)
     point = [np.array([[1.0, 0.5, 0.2]], np.float32)]
-    turned = [paper_batch((point, point), rng) for _ in range(400)]
-    assert all(np.array_equal(scans[0], submaps[0]) for scans, submaps in turned)
-    xyz = np.array([scans[0][0] for scans, _ in turned])
+    rotated = [paper_batch((point, point), rng) for _ in range(400)]
+    assert all(np.array_equal(scans[0], submaps[0]) for scans, submaps in rotated)
+    xyz = np.array([scans[0][0] for scans, _ in rotated])
     assert np.allclose(xyz[:, 2], 0.2)
     assert 0.18 < (xyz[:, 0] < 0).mean() < 0.32 and 0.18 < (xyz[:, 1] < 0).mean() < 0.32
     bearing = np.degrees(np.arctan2(np.abs(xyz[:, 1]), np.abs(xyz[:, 0])) - np.arctan2(0.5, 1.0))

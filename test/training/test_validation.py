@@ -47,7 +47,7 @@ def test_the_true_one_per_cent_grows_with_the_database() -> None:
     assert result.recall("R@1%", 100.0).rank == 8
 
 
-def test_a_query_turned_by_steps_finds_the_submap_that_a_heading_sensitive_code_gives_only_aligned() -> None:
+def test_a_query_rotated_by_steps_finds_the_submap_that_a_heading_sensitive_code_gives_only_aligned() -> None:
     rng = np.random.default_rng(3)
     submaps = rng.uniform(-1, 1, (40, 64, 3)).astype(np.float32)
     headings = 2 * np.pi * rng.integers(0, 8, 40) / 8

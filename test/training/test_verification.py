@@ -45,11 +45,11 @@ def validation_towns(make_places: Callable[..., Path], tmp_path: Path) -> list[V
     return [read_validation_town(folder / "validation_1000.npz") for folder in folders]
 
 
-def lots(weight: float, queries: int = 4000, answers: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulated(weight: float, queries: int = 4000, candidates: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distances, fits and which is right, drawn by the odds of the model itself: temperature 0.5."""
     rng = np.random.default_rng(1)
-    distances = rng.normal(9.0, 1.0, (queries, answers))
-    fits = rng.normal(0.1, 0.01, (queries, answers))
+    distances = rng.normal(9.0, 1.0, (queries, candidates))
+    fits = rng.normal(0.1, 0.01, (queries, candidates))
     odds = softmax(-(distances / 0.5 + weight * fits), axis=1)
     chosen = (odds.cumsum(axis=1) > rng.random((queries, 1))).argmax(axis=1)
     right = np.zeros(odds.shape, np.bool_)
@@ -59,26 +59,26 @@ def lots(weight: float, queries: int = 4000, answers: int = 20) -> tuple[np.ndar
 
 @pytest.mark.parametrize("weight", [30.0, 300.0])
 def test_the_weight_that_made_the_odds_is_found(weight: float) -> None:
-    distances, fits, right = lots(weight)
+    distances, fits, right = simulated(weight)
     assert fit_weight(distances, fits, 0.5, right) == pytest.approx(weight, rel=0.1)
 
 
 def test_the_unit_of_the_descriptors_does_not_matter() -> None:
-    distances, fits, right = lots(100.0, queries=500)
+    distances, fits, right = simulated(100.0, queries=500)
     once = fit_weight(distances, fits, 0.5, right)
     assert fit_weight(distances * np.float32(16.0), fits, 8.0, right) == pytest.approx(once, rel=1e-3)
 
 
 def test_a_distance_that_tells_nothing_gets_little() -> None:
     rng = np.random.default_rng(2)
-    distances, fits, right = lots(100.0, queries=1500)
+    distances, fits, right = simulated(100.0, queries=1500)
     of_nothing = fit_weight(distances, rng.permuted(fits, axis=1), 0.5, right)
     of_everything = fit_weight(rng.permuted(distances, axis=1), fits, 0.5, right)
     assert of_nothing < 30.0 < 1000.0 < of_everything
 
 
 def test_queries_that_teach_nothing_change_nothing() -> None:
-    distances, fits, right = lots(100.0, queries=300)
+    distances, fits, right = simulated(100.0, queries=300)
     more = np.concatenate((right, np.zeros((2, 20), np.bool_), np.ones((2, 20), np.bool_), right[:1]))
     blind = np.full((1, 20), np.inf, np.float32)
     again = fit_weight(
@@ -87,8 +87,8 @@ def test_queries_that_teach_nothing_change_nothing() -> None:
     assert again == fit_weight(distances, fits, 0.5, right)
 
 
-def test_nothing_to_learn_from_is_said() -> None:
-    distances, fits, right = lots(100.0, queries=4)
+def test_nothing_to_learn_from_is_reported() -> None:
+    distances, fits, right = simulated(100.0, queries=4)
     for nothing in (np.zeros_like(right), np.ones_like(right)):
         with pytest.raises(TrainingError, match="nothing to learn"):
             fit_weight(distances, fits, 0.5, nothing)

@@ -1,4 +1,4 @@
-"""A kill while a file is written, a full disk, files of something else: said clearly, and nothing is lost."""
+"""A kill while a file is written, a full disk, files of something else: reported clearly, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def disk_of(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_is_said_and_costs_nothing(finished: Path, places: Path, tiny: TrainConfig) -> None:
+def test_a_full_disk_is_reported_and_costs_nothing(finished: Path, places: Path, tiny: TrainConfig) -> None:
     before = {path.name: path.read_bytes() for path in finished.iterdir() if path.suffix != ".jsonl"}
     content = run_folder.load_state(finished)
     assert content is not None
@@ -104,7 +104,7 @@ def test_a_full_disk_is_said_and_costs_nothing(finished: Path, places: Path, tin
     assert after is not None and after["step"] == 3
 
 
-def test_no_space_left_is_said_in_those_words(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_space_left_is_reported_in_those_words(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = (finished / run_folder.STATE).read_bytes()
 
     def fill_up(state: object, file: object) -> None:
@@ -150,7 +150,7 @@ def test_damaged_settings_are_named(finished: Path, places: Path, tiny: TrainCon
         Trainer(tiny, [places], finished, Budget(steps=3)).check()
 
 
-def test_a_gpu_that_is_not_there_is_said(places: Path, tmp_path: Path, tiny: TrainConfig) -> None:
+def test_a_gpu_that_is_not_there_is_reported(places: Path, tmp_path: Path, tiny: TrainConfig) -> None:
     if torch.cuda.is_available():
         pytest.skip("there is one")
     config = dataclasses.replace(tiny, device="cuda")
@@ -167,8 +167,8 @@ def test_the_command_says_in_one_line_that_weights_are_another_model_s(
     arguments = ["run", "--places", str(places), "--config", str(settings), "--output", str(tmp_path / "run")]
     arguments += ["--budget-steps", "1"]
     assert train.main([*arguments, "--initial", str(places / "train_0.npz")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "train_0.npz cannot be read as safetensors" in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1 and "train_0.npz cannot be read as safetensors" in printed
     other = tmp_path / "other.safetensors"
     model = make_network(dataclasses.replace(tiny.model, network="pointnetvlad"))
     save_checkpoint(other, model, tiny.preprocessing)
