@@ -82,7 +82,7 @@ def test_no_scheduler_no_build(
     pytest.importorskip("distributed")
     with monkeypatch.context() as patch:
         patch.setattr("crossloc3d_ros.workers._ANSWER_WITHIN_S", 1)
-        with pytest.raises(ConfigError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        with pytest.raises(ConfigError, match=r"no Dask scheduler responds at tcp://127\.0\.0\.1:9"):
             build_map([survey_file], tmp_path / "a", encoder, scheduler="tcp://127.0.0.1:9")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match="pip install distributed"):
