@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -23,9 +22,7 @@ from crossloc3d_ros.aerial_map.store import AerialMap, read_manifest
 from crossloc3d_ros.config import LocalizerNodeConfig
 from crossloc3d_ros.errors import ConfigError, CrossLocError
 from crossloc3d_ros.localization.fusion.odometry import require_kiss_icp
-from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer
-from crossloc3d_ros.localization.session import Session
 from crossloc3d_ros.ros.diagnostics import (
     SILENCE_S,
     Snapshot,
@@ -35,16 +32,11 @@ from crossloc3d_ros.ros.diagnostics import (
     snapshot_values,
     worker_complaint,
 )
-from crossloc3d_ros.ros.imu_input import ImuInput
-from crossloc3d_ros.ros.initial_pose_input import InitialPoseInput
-from crossloc3d_ros.ros.lidar_input import Arrival, LidarInput
-from crossloc3d_ros.ros.localizing import Localizing
-from crossloc3d_ros.ros.odometry_input import OdometryInput, odometry_complaint
-from crossloc3d_ros.ros.outputs import Outputs
+from crossloc3d_ros.ros.odometry_input import odometry_complaint
 from crossloc3d_ros.ros.parameters import ConfigParameters
-from crossloc3d_ros.ros.transforms import MapTransform, TransformSource
+from crossloc3d_ros.ros.parts import Parts, Transforms, assemble
 from crossloc3d_ros.ros.worker import Worker
-from crossloc3d_ros.types import Float64Array, TrackState
+from crossloc3d_ros.types import TrackState
 
 DIAGNOSTICS_PERIOD_S = 1.0
 SETTINGS_WHILE_RUNNING = ("top_k", "scan.", "retrieval.", "alignment.", "fusion.")
@@ -63,63 +55,6 @@ def load_localizer(config: LocalizerNodeConfig) -> Localizer:
     return Localizer(AerialMap.load(Path(config.map), encoder.fingerprint), encoder, config, threads=config.threads)
 
 
-class _Transforms:
-    """What the node has of TF; checked before weights and map are loaded."""
-
-    def __init__(self, node: LifecycleNode, config: LocalizerNodeConfig) -> None:
-        """Listen and announce as configured; ConfigError for what cannot be."""
-        if config.mounting_from_tf and not config.base_frame_id:
-            raise ConfigError("mounting_from_tf needs a base_frame_id")
-        if config.tf_broadcast and config.odometry != "topic":
-            raise ConfigError("tf_broadcast needs odometry from a topic: that is the frame whose pose it publishes")
-        tolerance_ns = round(1e9 * config.transform_tolerance)
-        self.map = MapTransform(node, config.global_frame_id, tolerance_ns) if config.tf_broadcast else None
-        self.source = TransformSource(node, config.base_frame_id) if config.mounting_from_tf else None
-
-    @property
-    def pose_on_base(self) -> Callable[[str], Float64Array] | None:
-        """What gives `T_base_frame` (4, 4) by the frame's name; None where TF is not used for it."""
-        return None if self.source is None else self.source.pose_on_base
-
-    def close(self) -> None:
-        """Withdraw from TF."""
-        for part in (self.map, self.source):
-            if part is not None:
-                part.close()
-
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """What a configured node is made of."""
-
-    config: LocalizerNodeConfig
-    localizer: Localizer
-    lidar: LidarInput
-    odometry: OdometryInput | None
-    imu: ImuInput
-    initial_pose: InitialPoseInput
-    outputs: Outputs
-    localizing: Localizing
-    worker: Worker
-    statistics: Statistics
-    transforms: _Transforms
-
-    def subscribe(self, node: LifecycleNode) -> Iterator[object]:
-        """Yield subscription after subscription; the clouds last, when everything beside them is there."""
-        if self.odometry is not None:
-            yield from self.odometry.subscribe(node)
-        yield from self.imu.subscribe(node)
-        yield from self.initial_pose.subscribe()
-        yield from self.lidar.subscribe(node)
-
-    def close(self) -> None:
-        """Withdraw everything from ROS."""
-        self.localizing.close()
-        self.initial_pose.close()
-        self.outputs.close()
-        self.transforms.close()
-
-
 class LocalizerNode(LifecycleNode):
     """Subscribe to clouds, localize them, publish the fix and what led to it."""
 
@@ -127,7 +62,7 @@ class LocalizerNode(LifecycleNode):
         """Declare the parameters; `load` makes the localizer at configuration. Raises ConfigError."""
         super().__init__("localizer", automatically_declare_parameters_from_overrides=True)
         self._load = load
-        self._parts: _Parts | None = None
+        self._parts: Parts | None = None
         self._subscriptions_of_parts: list[object] = []
         self._abandoned: list[Worker] = []
         """Of earlier configurations, whose scan at work did not end."""
@@ -219,10 +154,10 @@ class LocalizerNode(LifecycleNode):
         started = time.monotonic()
         if config.odometry == "scan":
             require_kiss_icp()
-        transforms = _Transforms(self, config)
+        transforms = Transforms(self, config)
         try:
             localizer = self._load(config)
-            self._parts = self._assemble(config, localizer, transforms)
+            self._parts = assemble(self, config, localizer, transforms, self._status_name, self._why_no_prior)
         except BaseException:
             transforms.close()
             raise
@@ -231,46 +166,6 @@ class LocalizerNode(LifecycleNode):
             f"map '{config.map}': {len(localizer.aerial_map.submaps.grid):,} submaps, "
             f"origin {origin.latitude:.6f}, {origin.longitude:.6f}; "
             f"weights {localizer.encoder.fingerprint[:12]}; loaded in {time.monotonic() - started:.1f} s"
-        )
-
-    def _assemble(self, config: LocalizerNodeConfig, localizer: Localizer, transforms: _Transforms) -> _Parts:
-        """Bring inputs, work and outputs together."""
-        pose_on_base, statistics = transforms.pose_on_base, Statistics()
-        session = Session(localizer, config.odometry, config.imu_time_constant_s)
-        frames = config.base_frame_id, config.odom_frame_id
-        uses_topic = config.odometry == "topic"
-        odometry = OdometryInput(*frames, config.odometry_timeout_s, pose_on_base) if uses_topic else None
-        frame = localizer.aerial_map.frame
-        outputs = Outputs(self, config, frame, self._status_name, transforms.map)
-        localizing = Localizing(session, odometry, outputs, statistics, self.get_logger())
-        worker = Worker("localize", config.queue_depth)
-
-        def offer(arrival: Arrival) -> int:
-            return worker.offer(lambda: localizing.process(arrival))
-
-        def on_acceleration(stamp_ns: int, acceleration: Float64Array) -> None:
-            worker.post(lambda: session.add_acceleration(stamp_ns, acceleration), is_sample=True)
-
-        def on_heading(heading: PosePrior) -> None:
-            worker.post(lambda: session.add_heading(heading), is_sample=True)
-
-        def on_prior(prior: PosePrior) -> None:
-            worker.post(lambda: session.add_prior(prior))
-
-        return _Parts(
-            config=config,
-            localizer=localizer,
-            lidar=LidarInput(offer, statistics, pose_on_base),
-            odometry=odometry,
-            imu=ImuInput(config, frame, on_acceleration, on_heading, pose_on_base),
-            initial_pose=InitialPoseInput(
-                self, localizer.aerial_map, config.global_frame_id, config.base_frame_id, on_prior, self._why_no_prior
-            ),
-            outputs=outputs,
-            localizing=localizing,
-            worker=worker,
-            statistics=statistics,
-            transforms=transforms,
         )
 
     def _activate(self) -> None:
