@@ -1,17 +1,23 @@
-"""Learn what air and ground have in common, and what a score of it means, from simulated towns of known poses.
+"""Learn what air and ground have in common, and what a score of it means, from scans of known poses.
 
-First the log likelihood ratios: how often a beam was returned from a cell, by what the aerial map shows there, and how
-often beams come inside of what the map shows closed, at true poses and at others. Then the calibration: every scan is
-aligned on the whole map, and the scores of its best poses, right, wrong or off the map, calibrate the probability of a
-score.
+First the log likelihood ratios: how often a beam hits something in a cell, by what the aerial map shows there, and how
+often beams come inside of what the map shows closed, at true poses and at others. Then the weights of the measures by
+which `alignment.local_null` compares a score with that of a scan from elsewhere: every scan is aligned on the whole
+map, and the measures of its best poses, right, wrong or off the map, are fitted as a conditional logit beside the null
+hypothesis.
+
+Both are learned from several maps: simulated towns with surveys of several densities, and real surveys. For the
+weights, each fold is aligned with log ratios that were learned without it: so they are those of places that nothing was
+learned from, and of kinds of surveys that were never seen.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,83 +26,122 @@ from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, PreprocessingConfig, ScanConfig
-from crossloc3d_ros.datasets.pose_sets import PoseSet
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.errors import TrainingError
-from crossloc3d_ros.localization.alignment.aligner import Aligner, fine_counts
-from crossloc3d_ros.localization.alignment.evidence import CHANNELS, Evidence, evidence_of
+from crossloc3d_ros.localization.alignment.aligner import Aligner
+from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evidence, evidence_of
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
 from crossloc3d_ros.localization.alignment.observation_model import (
     CLASSES,
+    HOLE,
+    MEASURES,
     OPEN_GROUND,
+    PATTERNS,
     ObservationModel,
     fit_log_ratios,
 )
-from crossloc3d_ros.types import AlignedPoses, Float64Array, no_candidates
+from crossloc3d_ros.types import AlignedPoses, BoolArray, Float64Array, Int64Array, no_candidates
 
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
 """A pose is right within these."""
+NEAR_M = 10.0
+"""A pose that is not right but as near as this teaches neither."""
 
 _OTHERS = 8  # wrong poses that the evidence of each scan is counted at
+_POSES = 16  # of each scan that the weights are fitted to: the worse ones decide nothing
+_RIDGE = 0.01  # of the standardized weights: measures that say the same share their weight
+_INITIAL = (5.0, 8.0, 5.0, -3.0)  # weights before any are learned, for the order of the poses alone
 
 Progress = Callable[[str, float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredPoses:
-    """The scores of the best poses of one scan."""
+class LearningSet:
+    """A map, and scans that were taken on it and off it."""
 
-    scores: Float64Array
-    """(p,) nats, before the calibration."""
-    expected: float
-    """Score to be expected at the true pose."""
+    name: str
+    fold: str
+    """Sets of one fold show the same places."""
+    map_folder: Path
+    on_map: Sequence[RawScan]
+    off_map: Sequence[RawScan] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPoses:
+    """The best poses of one scan."""
+
+    set_name: str
+    measures: Float64Array
+    """(p, M) see `MEASURES`."""
     right: int | None
     """Which of them is right; None: none is, or the scan is from off the map."""
     log_prior: float
 
 
 def fit_alignment(
-    pose_set: PoseSet, config: AlignmentConfig | None = None, progress: Progress | None = None
-) -> tuple[ObservationModel, list[ScoredPoses]]:
-    """Return the observation model learned from a pose set, and the scores that its calibration was fitted to.
+    sets: Sequence[LearningSet], config: AlignmentConfig | None = None, progress: Progress | None = None
+) -> tuple[ObservationModel, list[MeasuredPoses]]:
+    """Return the observation model learned from sets, and the poses that its weights were fitted to.
 
-    The set needs scans on its map and off it; TrainingError otherwise.
+    TrainingError where there are not two folds with scans on their maps, or no scan off its map.
     """
     report = progress or (lambda stage, done, total, unit: None)
-    on_map = [scan for scan in pose_set.scans if pose_set.on_map[scan.area]]
-    if not on_map or len(on_map) == len(pose_set.scans):
-        raise TrainingError("an alignment is learned from scans on the map and off it; the set holds one kind only")
-    aerial_map = AerialMap.load(pose_set.map_folder)
-    fitted = fit_log_ratios(*_seen(aerial_map, on_map, report))
-    model = ObservationModel(*fitted, expected_share=0.0, temperature=1.0)
-    aligner = Aligner(aerial_map, config or AlignmentConfig(), model)
-    scored = []
-    for i, scan in enumerate(pose_set.scans):
-        poses = _scored_poses(aligner, scan, bool(pose_set.on_map[scan.area]))
-        if poses is not None:
-            scored.append(poses)
-        report("aligning", i + 1, len(pose_set.scans), "scans")
-    share, temperature = calibrate(scored)
-    return dataclasses.replace(model, expected_share=share, temperature=temperature), scored
+    folds = sorted({each.fold for each in sets if len(each.on_map)})
+    if len(folds) < 2 or not any(len(each.off_map) for each in sets):
+        raise TrainingError("an alignment is learned from two folds of scans on their maps, and scans off them")
+    seen = _seen_by_fold(sets, report)
+    everything = _sum(seen.values())
+    measured: list[MeasuredPoses] = []
+    total = sum(len(each.on_map) + len(each.off_map) for each in sets)
+    done = 0
+    for fold, of_fold in _by_fold(sets).items():
+        others = [counts for name, counts in seen.items() if name != fold]
+        model = _model(_sum(others), np.array(_INITIAL))
+        for each in of_fold:
+            aligner = Aligner(AerialMap.load(each.map_folder), config or AlignmentConfig(), model)
+            for scan, on_map in _scans(each):
+                poses = _measured_poses(each.name, aligner, scan, on_map)
+                measured += [] if poses is None else [poses]
+                done += 1
+                report("aligning", done, total, "scans")
+            aligner.close()
+    return _model(everything, fit_weights(measured)), measured
 
 
-def calibrate(scored: Sequence[ScoredPoses]) -> tuple[float, float]:
-    """Return share of the expected score and temperature that make the right poses likeliest."""
+def fit_weights(measured: Sequence[MeasuredPoses]) -> Float64Array:
+    """Return the weights (M + 1,) under which the right poses are likeliest: none is negative but for the constant.
 
-    def loss(x: Float64Array) -> float:
-        share, temperature = x[0], math.exp(x[1])
-        total = 0.0
-        for poses in scored:
-            log_odds = (poses.scores - share * poses.expected) / temperature + poses.log_prior
-            everything = np.logaddexp(0.0, np.logaddexp.reduce(log_odds)) if len(log_odds) else 0.0
-            total += everything - (0.0 if poses.right is None else log_odds[poses.right])
-        return float(total)
+    A conditional logit: log odds of pose i to the null hypothesis are weights . measures + constant + log prior. Each
+    set counts by the square root of its scans, so that no large one decides alone.
+    """
+    some = [poses for poses in measured if len(poses.measures)]
+    measures = np.concatenate([poses.measures for poses in some])
+    scan = np.repeat(np.arange(len(some)), [len(poses.measures) for poses in some])
+    prior = np.array([poses.log_prior for poses in some])[scan]
+    right = _right_rows(some)
+    sizes = {poses.set_name: 0 for poses in some}
+    for poses in some:
+        sizes[poses.set_name] += 1
+    share = np.array([1.0 / math.sqrt(sizes[poses.set_name]) for poses in some])
+    middle, spread = measures.mean(axis=0), np.maximum(measures.std(axis=0), 1e-9)
+    standardized = np.column_stack([(measures - middle) / spread, np.ones(len(measures))])
 
-    best = min(
-        (minimize(loss, [share, math.log(t)], method="Nelder-Mead") for share in (0.4, 0.6) for t in (5.0, 20.0)),
-        key=lambda result: float(result.fun),
-    )
-    return float(best.x[0]), float(math.exp(best.x[1]))
+    def loss(weights: Float64Array) -> tuple[float, Float64Array]:
+        log_odds = standardized @ weights + prior
+        largest = np.zeros(len(some))
+        np.maximum.at(largest, scan, log_odds)
+        odds = np.exp(log_odds - largest[scan])
+        everything = np.exp(-largest) + np.bincount(scan, odds, len(some))
+        value = share @ (largest + np.log(everything)) - share[scan[right]] @ log_odds[right]
+        off = share[scan] * (odds / everything[scan] - right)
+        ridge = _RIDGE * np.append(weights[:-1], 0.0)
+        return float(value + 0.5 * ridge @ weights), standardized.T @ off + ridge
+
+    bounds = [(0.0, None)] * measures.shape[1] + [(None, None)]
+    found = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds).x
+    weights = found[:-1] / spread
+    return np.append(weights, found[-1] - weights @ middle)
 
 
 def prepared_of(scan: RawScan) -> PreparedScan:
@@ -104,36 +149,87 @@ def prepared_of(scan: RawScan) -> PreparedScan:
     return prepare_scan(scan.as_scan(), ScanConfig(), PreprocessingConfig(), scan.up_base, scan.T_base_lidar)
 
 
-def is_right(aligned: AlignedPoses, scan: RawScan) -> np.ndarray:
+def is_right(aligned: AlignedPoses, scan: RawScan) -> BoolArray:
     """Return which aligned poses (p,) are those of the scan."""
-    away = np.hypot(*(aligned.grid[:, :2] - scan.T_grid_base[:2, 3]).T)
-    rotation = np.abs(wrap(aligned.heading_rad - scan.heading_rad))
-    return np.asarray((away <= RIGHT_M) & (rotation <= RIGHT_RAD))
+    return np.asarray(
+        (_away(aligned, scan) <= RIGHT_M) & (np.abs(wrap(aligned.heading_rad - scan.heading_rad)) <= RIGHT_RAD)
+    )
 
 
-def _seen(aerial_map: AerialMap, scans: Sequence[RawScan], report: Progress) -> tuple[Float64Array, Float64Array]:
-    """Count (CHANNELS, CLASSES) on which classes the evidence of scans falls at their true poses, and at others."""
-    ratios = np.zeros((CHANNELS, CLASSES), np.float32)
-    nothing = ObservationModel(ratios, ratios, np.zeros(CHANNELS))
-    likelihood = MapLikelihood(aerial_map, nothing)
+def _away(aligned: AlignedPoses, scan: RawScan) -> Float64Array:
+    return np.asarray(np.hypot(*(aligned.grid[:, :2] - scan.T_grid_base[:2, 3]).T))
+
+
+def _right_rows(some: Sequence[MeasuredPoses]) -> BoolArray:
+    rows = []
+    for poses in some:
+        is_its = np.zeros(len(poses.measures), np.bool_)
+        if poses.right is not None:
+            is_its[poses.right] = True
+        rows.append(is_its)
+    return np.concatenate(rows)
+
+
+def _by_fold(sets: Sequence[LearningSet]) -> dict[str, list[LearningSet]]:
+    folds: dict[str, list[LearningSet]] = {}
+    for each in sets:
+        folds.setdefault(each.fold, []).append(each)
+    return folds
+
+
+def _scans(learned: LearningSet) -> Iterator[tuple[RawScan, bool]]:
+    yield from ((scan, True) for scan in learned.on_map)
+    yield from ((scan, False) for scan in learned.off_map)
+
+
+def _sum(counts: Iterable[Float64Array]) -> Float64Array:
+    return functools.reduce(np.add, counts)
+
+
+def _model(counts: Float64Array, weights: Float64Array) -> ObservationModel:
+    return ObservationModel(*fit_log_ratios(*counts), weights)
+
+
+def _seen_by_fold(sets: Sequence[LearningSet], report: Progress) -> Mapping[str, Float64Array]:
+    """Count (2, CHANNELS, CLASSES) on which classes the evidence of each fold falls at true poses, and at others.
+
+    A set counts by the square root of its scans.
+    """
+    counts: dict[str, Float64Array] = {}
+    total, done = sum(len(each.on_map) for each in sets), 0
+    for each in sets:
+        if not len(each.on_map):
+            continue
+        likelihood = _bare_likelihood(each.map_folder)
+        seen = np.zeros((2, CHANNELS, CLASSES))
+        others = _places(likelihood)
+        rng = np.random.default_rng(0)
+        for scan in each.on_map:
+            prepared, T = prepared_of(scan), scan.T_base_lidar
+            evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
+            true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
+            _lay(evidence, likelihood, true, seen[0])
+            for place in others[rng.integers(0, len(others), _OTHERS)]:
+                _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), seen[1])
+            done += 1
+            report("learning", done, total, "scans")
+        seen /= math.sqrt(len(each.on_map))
+        counts[each.fold] = counts[each.fold] + seen if each.fold in counts else seen
+    return counts
+
+
+def _bare_likelihood(map_folder: Path) -> MapLikelihood:
+    nothing = np.zeros((CHANNELS, CLASSES), np.float32)
+    model = ObservationModel(nothing, nothing, np.full(LAYERS, 0.5), np.zeros(len(MEASURES) + 1))
+    likelihood = MapLikelihood(AerialMap.load(map_folder), model)
     likelihood.prepare()
-    rng = np.random.default_rng(0)
-    at_true, at_others = np.zeros((CHANNELS, CLASSES)), np.zeros((CHANNELS, CLASSES))
-    others = _places(likelihood)
-    for i, scan in enumerate(scans):
-        prepared, T = prepared_of(scan), scan.T_base_lidar
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
-        true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
-        _lay(evidence, likelihood, true, at_true)
-        for place in others[rng.integers(0, len(others), _OTHERS)]:
-            _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), at_others)
-        report("learning", i + 1, len(scans), "scans")
-    return at_true, at_others
+    return likelihood
 
 
 def _places(likelihood: MapLikelihood) -> Float64Array:
     """Return the places (n, 2) where a robot could stand: middles of cells of open ground."""
-    rows, columns = np.nonzero(likelihood.classes == OPEN_GROUND)
+    classes = likelihood.classes
+    rows, columns = np.nonzero((classes < HOLE) & (classes % PATTERNS == OPEN_GROUND))
     west, south, east, north = likelihood.aerial_map.bounds
     x, y = columns + 0.5, rows + 0.5
     on_map = (x > west - likelihood.west_m) & (x < east - likelihood.west_m)
@@ -144,19 +240,28 @@ def _places(likelihood: MapLikelihood) -> Float64Array:
 def _lay(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Array, counts: Float64Array) -> None:
     """Count (CHANNELS, CLASSES) on which classes the evidence falls at a pose (3,)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y = (pose[:2] + evidence.xy_m @ np.array([[c, s], [-s, c]])).T
-    classes = likelihood.classes[np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)]
-    np.add.at(counts, (evidence.channel, classes), 1.0)
+    x, y = np.floor(pose[:2] + evidence.xy_m @ np.array([[c, s], [-s, c]])).astype(np.int64).T
+    rows, columns = likelihood.classes.shape
+    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
+    np.add.at(counts, (evidence.channel[inside], likelihood.classes[y[inside], x[inside]]), 1.0)
 
 
-def _scored_poses(aligner: Aligner, scan: RawScan, on_map: bool) -> ScoredPoses | None:
+def _measured_poses(name: str, aligner: Aligner, scan: RawScan, on_map: bool) -> MeasuredPoses | None:
     """Search the whole map for one scan; None where it cannot be aligned."""
     prepared, T = prepared_of(scan), scan.T_base_lidar
-    sensor_xy = float(T[0, 3]), float(T[1, 3])
-    aligned = aligner.align(prepared, sensor_xy, no_candidates(), search_map=True)
-    if not len(aligned):
+    alignment = aligner.begin(prepared, (float(T[0, 3]), float(T[1, 3])), no_candidates())
+    if alignment is None:
         return None
-    expected = float(aligner.model.expected @ fine_counts(prepared, sensor_xy))
-    right = np.flatnonzero(is_right(aligned, scan)) if on_map else np.empty(0, np.int64)
-    # The model's calibration is neutral here: log likelihoods are scores.
-    return ScoredPoses(aligned.log_likelihood, expected, int(right[0]) if len(right) else None, aligned.log_prior)
+    alignment.search_map()
+    aligned, measures = alignment.measured()
+    kept: Int64Array = np.arange(len(aligned))
+    right = np.empty(0, np.int64)
+    if on_map:
+        is_its = is_right(aligned, scan)
+        kept = np.flatnonzero(is_its | (_away(aligned, scan) >= NEAR_M))
+        right = np.flatnonzero(is_its[kept])
+        kept = np.delete(kept, right[1:])  # one pose of the robot is enough
+    if len(right) and right[0] >= _POSES:
+        kept[_POSES - 1], right = kept[right[0]], np.array([_POSES - 1])
+    kept = kept[:_POSES]
+    return MeasuredPoses(name, measures[kept], int(right[0]) if len(right) else None, aligned.log_prior)

@@ -19,15 +19,16 @@ from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig, usable_threads
 from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
-from crossloc3d_ros.localization.alignment.observation_model import ObservationModel
+from crossloc3d_ros.localization.alignment.local_null import measures
+from crossloc3d_ros.localization.alignment.observation_model import MEASURES, ObservationModel
 from crossloc3d_ros.localization.alignment.pose_search import (
-    Peaks,
     are_near,
     around,
     climb,
     inside,
     local_search,
     merge,
+    no_peaks,
     scores_at,
     search_cells,
 )
@@ -58,6 +59,7 @@ MAP_COARSE_FACTOR, MAP_FINE_FACTOR = 4, 2
 _PLACE_M = 35.0  # so far from the centre of its submap a pose is still of its place
 _NOT_RETRIEVED = 0.2  # likelihood ratio of a place that is not among the candidates
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)  # poses this near belong to one maximum
+_EXPLAINED = MEASURES.index("explained")
 # Where the score is sampled for the covariance: about two standard deviations of a good pose to each side.
 _SHAPE_STEPS_M = np.array([-1.2, -0.6, 0.0, 0.6, 1.2])
 _SHAPE_STEPS_RAD = np.radians([-1.5, 0.0, 1.5])
@@ -171,7 +173,7 @@ class Alignment:
         self._places = aligner.local(candidates.grid[:, :2])
         self._fine = fine_evidence(evidence)
         self._climb_evidence = self._fine.sample(_CLIMB_HITS, _CLIMB_FREE)
-        self._maxima, self._is_refined = _no_peaks(), np.empty(0, np.bool_)
+        self._maxima, self._is_refined = no_peaks(), np.empty(0, np.bool_)
         self._most_refined = 0
         self._found, self._tracked = _no_poses(), _no_poses()
 
@@ -210,18 +212,21 @@ class Alignment:
         refined, log_likelihood, probabilities = self._weighted()
         if not len(refined.poses):
             return no_aligned_poses()
-        expected = max(float(self._aligner.model.expected @ self._fine.counts()), 1e-9)
         return AlignedPoses(
             grid=self._aligner.on_grid(refined.poses),
             heading_rad=_headings(refined.poses[:, 2]),
             covariance=self._covariances(refined.poses),
             log_likelihood=log_likelihood,
             probabilities=probabilities,
-            inliers=np.clip(refined.scores / expected, 0.0, 1.0),
+            inliers=np.clip(refined.measures[:, _EXPLAINED], 0.0, 1.0),
             converged=refined.converged,
             source=refined.source,
             log_prior=self._aligner.log_prior,
         )
+
+    def measured(self) -> tuple[AlignedPoses, Float64Array]:
+        """Return where the scan fits, best first, and the `MEASURES` (n, M) of each pose."""
+        return self.result(), self._weighted()[0].measures
 
     def _search(self, runs: Int64Array, coarse_maxima: int, fine_maxima: int) -> None:
         """Search the runs of coarse cells, and refine the best maxima that were not refined before."""
@@ -234,10 +239,11 @@ class Alignment:
         found = local_search(
             evidence, middle, seeds.poses, _MIDDLE_REACH_M, _MIDDLE_REACH_RAD, _MIDDLE_HEADINGS, self._pool
         )
-        self._maxima = Peaks(*map(np.concatenate, zip(vars(self._maxima).values(), vars(found).values(), strict=True)))
+        self._maxima = self._maxima.join(found)
         self._is_refined = np.append(self._is_refined, np.zeros(len(found.scores), np.bool_))
         self._most_refined += fine_maxima
-        merged = merge(self._maxima, _MIDDLE_REACH_M, _SAME_RAD)[: self._most_refined]
+        order = self._maxima.by_both()
+        merged = merge(self._maxima.poses, order, _MIDDLE_REACH_M, _SAME_RAD)[: self._most_refined]
         fresh = merged[~self._is_refined[merged]]
         self._is_refined[fresh] = True
         self._found = self._found.join(self._refined(self._maxima.poses[fresh], None))
@@ -248,19 +254,21 @@ class Alignment:
             self._climb_evidence, self._likelihood, poses, reach_m=self._config.hypothesis_radius_m, pool=self._pool
         )
         scores = scores_at(self._fine, self._likelihood, peaks.poses, self._pool)
+        measured = measures(self._fine, self._climb_evidence, scores, self._likelihood, peaks.poses, self._pool)
         if source is None:
             source = np.full(len(poses), WHOLE_MAP, np.int64)
             if len(self._places):
                 away = self._away(peaks.poses)
                 near = away.min(axis=1) <= 2.0 * self._config.candidate_radius_m
                 source[near] = away.argmin(axis=1)[near]
-        return _Poses(peaks.poses, scores, converged, source)
+        return _Poses(peaks.poses, scores, measured, converged, source)
 
     def _weighted(self) -> tuple[_Poses, Float64Array, Float64Array]:
         """Return the poses that are kept, best first, with log likelihoods and probabilities."""
-        found = self._found.take(merge(Peaks(self._found.poses, self._found.scores), _SAME_M, _SAME_RAD))
+        order = np.argsort(-self._found.scores, kind="stable")
+        found = self._found.take(merge(self._found.poses, order, _SAME_M, _SAME_RAD))
         poses = found.join(self._tracked)
-        log_likelihood = self._aligner.model.log_likelihood(poses.scores, self._fine.counts())
+        log_likelihood = self._aligner.model.log_likelihood(poses.measures)
         log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses)
         order = np.argsort(-log_likelihood, kind="stable")
         poses, log_likelihood = poses.take(order), log_likelihood[order]
@@ -303,6 +311,8 @@ class _Poses:
     """(p, 3) local metres, radians."""
     scores: Float64Array
     """(p,) nats, of the fine evidence."""
+    measures: Float64Array
+    """(p, M) the `MEASURES` of each."""
     converged: BoolArray
     """(p,) whether the climb converged near where it began."""
     source: Int64Array
@@ -316,17 +326,10 @@ class _Poses:
         return _Poses(*(np.concatenate(pair) for pair in pairs))
 
 
-def _no_peaks() -> Peaks:
-    return Peaks(np.empty((0, 3)), np.empty(0))
-
-
 def _no_poses() -> _Poses:
-    return _Poses(np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_), np.empty(0, np.int64))
-
-
-def fine_counts(prepared: PreparedScan, sensor_xy_m: tuple[float, float]) -> Int64Array:
-    """Return (CHANNELS,) how many cells of each channel a scan's scores are summed over."""
-    return fine_evidence(evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)).counts()
+    return _Poses(
+        np.empty((0, 3)), np.empty(0), np.empty((0, len(MEASURES))), np.empty(0, np.bool_), np.empty(0, np.int64)
+    )
 
 
 def fine_evidence(evidence: Evidence) -> Evidence:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,30 +23,43 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from scipy import ndimage
+from scipy.special import expit, logit
 
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS
-from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array
+from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
 SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "alignment.safetensors"
 HEIGHTS_M = np.array([0.4, 1.2, 2.5, 5.0, 10.0])
 """Heights above the terrain between which the classes change."""
 _STEPS = len(HEIGHTS_M) + 1
 _CLOSEDNESS = 4  # steps: pulses reach the ground in the cell, beside it, one cell farther, or nowhere near
+SUPPORT_BOUNDS = np.array([0.7, 0.95])
+"""Shares of cells with an echo, around a cell, between which the classes change: at some 1.2 and 3 echoes a square
+metre. How low, how high and how closed a place appears depends on how many echoes there are to show it."""
+_SUPPORTS = len(SUPPORT_BOUNDS) + 1
+_SUPPORT_CELLS = 11  # side of the square that the share is taken of: a hundred cells, within one flight strip
 _GROUND_M = 1.0  # an echo so low above the terrain came from the ground
 _HOLE_M = 20  # half the width of the widest hole in a survey that is taken for water
-HOLE = _CLOSEDNESS * _STEPS**3
+PATTERNS = _CLOSEDNESS * _STEPS**3
+"""Classes of one level of support."""
+HOLE = _SUPPORTS * PATTERNS
 """Class of a cell without an echo in the midst of those that have one: mostly water, which mirrors pulses away."""
 UNKNOWN = HOLE + 1
 """Class of a cell that was not surveyed."""
 CLASSES = UNKNOWN + 1
 OPEN_GROUND = 0
-"""Class of a cell where all is low and pulses reach the ground."""
+"""Pattern of a cell where all is low and pulses reach the ground."""
 MARGIN_CELLS = 2 * _HOLE_M + 4
 """So far beyond its edges a raster must be known for the classes inside to be right."""
+_SHARE_BOUNDS = (1e-6, 1.0 - 1e-6)  # for their logarithms
 _PRIOR = 50.0  # pseudo-observations that a class starts with
 _MAX_LOG_RATIO = 3.0  # of one cell; the 16 bit sums of the search rely on it
 _MAX_REFUTATION = 1.0  # of a closed cell: a house may have gone since the survey, and hundreds of its cells with it
+MEASURES = ("explained", "above shifted", "above spun")
+"""What a pose is weighed by, see `alignment.local_null`: the share of the evidence that it explains, and the logarithms
+of by how many standard deviations its sectors stand out of its surroundings."""
+_TENSORS = ("log_ratios", "search_ratios", "hit_share", "weights")
 _CLOSED = 2  # from this step on a cell is inside of something
 
 
@@ -60,23 +72,26 @@ class ObservationModel:
     search_ratios: Float32Array
     """(CHANNELS, CLASSES) the same without refutation, which in coarse cells would hold for the right pose too: for the
     coarse search."""
-    expected: Float64Array
-    """(CHANNELS,) mean log ratio of a cell of each channel at the true pose."""
-    expected_share: float = 0.5
-    """At this share of the score expected at the true pose, 'here' is as likely as 'off the map'."""
-    temperature: float = 10.0
-    """Score that multiplies the odds by e; scores are sums over cells that are not independent."""
+    hit_share: Float64Array
+    """(LAYERS,) share q of the cells of each layer, hit or free, that are hit."""
+    weights: Float64Array
+    """(M + 1,) of each of the `MEASURES`, and a constant: their sum is the log likelihood ratio of a pose."""
 
-    def log_likelihood(self, scores: Float64Array, counts: np.ndarray) -> Float64Array:
-        """Return log likelihood ratios (n,) of scores (n,) of a scan with `counts` (CHANNELS,) cells a channel."""
-        expected = float(self.expected @ counts)
-        return np.asarray((scores - self.expected_share * expected) / self.temperature)
+    def log_likelihood(self, measures: Float64Array) -> Float64Array:
+        """Return log likelihood ratios (p,) of 'the scan was taken here' to 'elsewhere' from `MEASURES` (p, M)."""
+        return np.asarray(measures @ self.weights[:-1] + self.weights[-1])
+
+    @functools.cached_property
+    def expectations(self) -> tuple[Float32Array, Float32Array]:
+        """Mean log ratio of a cell of each layer and class (LAYERS, CLASSES): at true poses, and of other scans."""
+        hit, free = (part.astype(np.float64) for part in (self.log_ratios[:LAYERS], self.log_ratios[LAYERS:]))
+        q = self.hit_share[:, None]
+        p = expit(logit(q) + hit - free)
+        return (p * hit + (1.0 - p) * free).astype(np.float32), (q * hit + (1.0 - q) * free).astype(np.float32)
 
     def save(self, path: Path) -> None:
         """Write the model to a file."""
-        tensors = {name: getattr(self, name) for name in ("log_ratios", "search_ratios", "expected")}
-        settings = {"expected_share": self.expected_share, "temperature": self.temperature}
-        save_file(tensors, path, metadata={"calibration": json.dumps(settings)})
+        save_file({name: getattr(self, name) for name in _TENSORS}, path, metadata={"measures": json.dumps(MEASURES)})
         path.chmod(0o644)  # safetensors keeps it from everybody else, also from the robot's user
 
     @classmethod
@@ -89,18 +104,17 @@ class ObservationModel:
 def _load(path: Path) -> ObservationModel:
     try:
         with safe_open(path, framework="numpy") as file:
-            ratios, gentle = file.get_tensor("log_ratios"), file.get_tensor("search_ratios")
-            expected = file.get_tensor("expected")
-            settings = json.loads(file.metadata()["calibration"])
-        if ratios.shape != (CHANNELS, CLASSES) or gentle.shape != ratios.shape or expected.shape != (CHANNELS,):
+            ratios, gentle, share, weights = (file.get_tensor(name) for name in _TENSORS)
+            measured = tuple(json.loads(file.metadata()["measures"]))
+        if ratios.shape != (CHANNELS, CLASSES) or gentle.shape != ratios.shape or share.shape != (LAYERS,):
             raise ValueError(f"log ratios of shape {ratios.shape}")
-        if not (np.abs([ratios, gentle]) <= _MAX_LOG_RATIO).all() or not np.isfinite(expected).all():
+        if not (np.abs([ratios, gentle]) <= _MAX_LOG_RATIO).all():
             raise ValueError(f"log ratios that are not finite, or beyond {_MAX_LOG_RATIO:g}")
-        if not (float(settings["temperature"]) > 0.0 and math.isfinite(float(settings["expected_share"]))):
-            raise ValueError(f"calibration {settings}")
-        return ObservationModel(
-            ratios, gentle, expected, float(settings["expected_share"]), float(settings["temperature"])
-        )
+        if measured != MEASURES or weights.shape != (len(MEASURES) + 1,) or not np.isfinite(weights).all():
+            raise ValueError(f"weights of the measures {', '.join(map(str, measured))}")
+        if not ((share > 0.0) & (share < 1.0)).all():
+            raise ValueError(f"shares of hits {share}")
+        return ObservationModel(ratios, gentle, share, weights)
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CrossLocError(f"{path} is not an observation model of this version: {error}") from error
 
@@ -109,18 +123,17 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
     """Return the class (H, W) of each cell of 1 m from terrain, surface and lowest echoes (H, W).
 
     All in metres, NaN where unknown. A gap inside of the survey is as high as the mean of its eight neighbours with an
-    echo: sparse surveys have many.
+    echo; where echoes are sparse, gaps are filled from as far as three cells away. What is left is a hole.
     """
     above = surface - terrain
     known = np.isfinite(above)
     if not known.any():
         return np.full(above.shape, UNKNOWN, np.int32)
+    support = np.full(above.shape, _SUPPORTS - 1)
     if not known.all():
         holes = _holes(known)
-        weight = ndimage.uniform_filter(known.astype(np.float32), 3, mode="constant")
-        total = ndimage.uniform_filter(np.where(known, above, 0.0), 3, mode="constant")
-        filled = holes & (weight > 0.05)  # a ninth for each
-        above = np.where(known, above, np.where(filled, total / np.where(filled, weight, 1.0), np.nan))
+        support = _support_levels(known, holes)
+        above = _filled(above, holes, support)
         known = np.isfinite(above)
         unseen = np.where(holes, HOLE, UNKNOWN)
     held = np.where(known, above, 0.0)
@@ -131,8 +144,27 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
     near, around = ndimage.maximum_filter(reached, 3), ndimage.maximum_filter(reached, 5)
     closed = 3 - reached.astype(np.int64) - near - around
     steps = [np.digitize(values, HEIGHTS_M) for values in (held, least, most)]
-    classes = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * _CLOSEDNESS + closed
+    patterns = ((steps[0] * _STEPS + steps[1]) * _STEPS + steps[2]) * _CLOSEDNESS + closed
+    classes = (_SUPPORTS - 1 - support) * PATTERNS + patterns
     return (classes if known.all() else np.where(known, classes, unseen)).astype(np.int32)
+
+
+def _support_levels(known: BoolArray, holes: BoolArray) -> Int64Array:
+    """Return the level (H, W) of the share of cells with an echo around each cell, among those of the survey."""
+    surveyed = ndimage.uniform_filter((known | holes).astype(np.float32), _SUPPORT_CELLS, mode="constant")
+    share = ndimage.uniform_filter(known.astype(np.float32), _SUPPORT_CELLS, mode="constant")
+    return np.asarray(np.digitize(share / np.maximum(surveyed, 1e-6), SUPPORT_BOUNDS), np.int64)
+
+
+def _filled(above: Float32Array, holes: BoolArray, support: Int64Array) -> Float32Array:
+    """Return heights (H, W) with the gaps of the survey filled by the mean of their neighbours, from echo to echo."""
+    for level in range(_SUPPORTS - 1, -1, -1):
+        known = np.isfinite(above)
+        weight = ndimage.uniform_filter(known.astype(np.float32), 3, mode="constant")
+        total = ndimage.uniform_filter(np.where(known, above, 0.0), 3, mode="constant")
+        filled = ~known & holes & (weight > 0.05) & (support <= level)  # a ninth for each
+        above = np.where(known, above, np.where(filled, total / np.where(filled, weight, 1.0), np.nan))
+    return above
 
 
 def _holes(known: BoolArray) -> BoolArray:
@@ -145,16 +177,18 @@ def _holes(known: BoolArray) -> BoolArray:
 
 
 def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32Array, Float32Array, Float64Array]:
-    """Return log ratios and search ratios (CHANNELS, CLASSES), and what to expect at true poses (CHANNELS,).
+    """Return log ratios and search ratios (CHANNELS, CLASSES), and the share of hits of each layer (LAYERS,).
 
     `here` and `elsewhere` (CHANNELS, CLASSES) count the cells of each channel that fell on each class at true poses,
     and at others. A layer in which all cells were hit, or none, counts only by where beams came; a class that was
-    hardly ever seen counts little.
+    hardly ever seen counts as its pattern does at all levels of support, and little where that is rare too.
     """
     hits, free = here[:LAYERS], here[LAYERS:]
     seen, others = hits + free, elsewhere[:LAYERS] + elsewhere[LAYERS:]
     share = hits.sum(axis=1, keepdims=True) / np.maximum(seen.sum(axis=1, keepdims=True), 1e-9)
-    p = (hits + _PRIOR * share) / (seen + _PRIOR)
+    pooled = [_over_supports(counts) for counts in (hits, seen)]
+    usual = (pooled[0] + _PRIOR * share) / (pooled[1] + _PRIOR)
+    p = (hits + _PRIOR * usual) / (seen + _PRIOR)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = np.concatenate([np.log(p / share), np.log((1.0 - p) / (1.0 - share))])
     ratios[np.tile((share <= 0.0) | (share >= 1.0), (2, 1))[:, 0]] = 0.0
@@ -167,5 +201,12 @@ def fit_log_ratios(here: Float64Array, elsewhere: Float64Array) -> tuple[Float32
     for values in (ratios, full):
         values[:, UNKNOWN] = 0.0
         np.clip(values, -_MAX_LOG_RATIO, _MAX_LOG_RATIO, out=values)
-    expected = (here * full).sum(axis=1) / np.maximum(here.sum(axis=1), 1.0)
-    return full.astype(np.float32), ratios.astype(np.float32), expected
+    return full.astype(np.float32), ratios.astype(np.float32), np.clip(share[:, 0], *_SHARE_BOUNDS)
+
+
+def _over_supports(counts: Float64Array) -> Float64Array:
+    """Return counts (L, CLASSES) in which each pattern has the sum over all levels of support."""
+    pooled = counts.copy()
+    by_support = counts[:, :HOLE].reshape(len(counts), _SUPPORTS, PATTERNS)
+    pooled[:, :HOLE] = np.tile(by_support.sum(axis=1), (1, _SUPPORTS))
+    return pooled

@@ -14,16 +14,19 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy import ndimage
 
 from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.localization.alignment.evidence import CELL_M, LAYERS, Evidence
 from crossloc3d_ros.localization.alignment.likelihood import QUANTA, Int16Array, Level, MapLikelihood, UInt16Array
+from crossloc3d_ros.localization.alignment.surroundings import TURNED
 from crossloc3d_ros.localization.alignment.thread_pool import SERIAL, ThreadPool
 from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 # Of the climb, metres and radians: from half a cell of the finest level down to the error of the map.
 _STEPS = ((1.0, math.radians(2.0)), (0.5, math.radians(1.0)), (0.25, math.radians(0.5)), (0.12, math.radians(0.25)))
 _MOVES = 6  # at most so many moves of each size: together they reach farther than a cell of that level
+_AROUND_M = 52.0  # side of the surroundings of a cell: wider than a street, smaller than a quarter of one kind
 _CONSIDERED = 400  # times as many cells as peaks are compared in full: neighbours of a peak score nearly as high
 
 
@@ -35,6 +38,22 @@ class Peaks:
     """(p, 3) metres east and north of the likelihood's south-west corner, heading in radians from east."""
     scores: Float64Array
     """(p,) nats."""
+    prominence: Float64Array
+    """(p,) how many standard deviations the score lies above the mean of the surroundings; 0 where not computed."""
+
+    def join(self, other: Peaks) -> Peaks:
+        """Return these peaks and then the others."""
+        return Peaks(*map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True)))
+
+    def by_both(self) -> Int64Array:
+        """Return the rows in turns by score and by prominence, best first."""
+        ranks = [np.argsort(np.argsort(-values, kind="stable")) for values in (self.scores, self.prominence)]
+        return np.argsort(np.minimum(2 * ranks[0], 2 * ranks[1] + 1), kind="stable")
+
+
+def no_peaks() -> Peaks:
+    """Return no peak."""
+    return Peaks(np.empty((0, 3)), np.empty(0), np.empty(0))
 
 
 def search_cells(
@@ -46,33 +65,63 @@ def search_cells(
     apart_m: float,
     pool: ThreadPool = SERIAL,
 ) -> Peaks:
-    """Return the best poses with the base in one of the cells of a level that `runs` names, best first.
+    """Return the best poses with the base in one of the cells of a level that `runs` names.
 
     They are at least `apart_m` apart. `runs` (R, 3): row, first column and length of stretches of cells, as `around`
     and `inside` give them; so far from the edge of the level that the evidence stays inside. `evidence` is in cells of
     the level, its free space in blocks of 2 x 2. A cell has one heading, its best of `headings` evenly over the circle.
+
+    Half of them have the highest scores, half the highest prominence. Where a place would explain the scan from
+    anywhere, as woods do, a high score is no evidence; where a survey is sparse or old, the right pose may score low,
+    but still far above what is around it.
     """
     if not len(runs) or not len(evidence):
-        return Peaks(np.empty((0, 3)), np.empty(0))
+        return no_peaks()
     angles = 2.0 * math.pi * np.arange(headings) / headings
     xy, channel = np.ascontiguousarray(evidence.xy_m), evidence.channel
 
-    def part(which: Int64Array) -> tuple[Int16Array, Int16Array]:
-        best, heading = _correlate(level.ratios, xy, channel, level.cell_m, angles[which], runs, LAYERS)
-        return best, which[heading].astype(np.int16)
+    def part(which: Int64Array) -> tuple[Int16Array, Int16Array, Float64Array, Float64Array]:
+        found: tuple[Int16Array, Int16Array, Float64Array, Float64Array] = _correlate(
+            level.ratios, xy, channel, level.cell_m, angles[which], runs, LAYERS
+        )
+        best, heading, total, squares = found
+        return best, which[heading].astype(np.int16), total, squares
 
     # In order, so that the first of several best headings is taken, by however many threads.
     results = pool.map(part, np.array_split(np.arange(headings), min(pool.threads, headings)))
-    best, heading = results[0]
-    for other, its_heading in results[1:]:
+    best, heading, total, squares = results[0]
+    for other, its_heading, its_total, its_squares in results[1:]:
         better = other > best
         best, heading = np.where(better, other, best), np.where(better, its_heading, heading)
+        total, squares = total + its_total, squares + its_squares
     rows = np.repeat(runs[:, 0], runs[:, 2])
     columns = np.concatenate([np.arange(start, start + count) for start, count in runs[:, 1:]])
+    mean, deviation = _around_cells(rows, columns, total / headings, squares / headings, level.cell_m)
+    prominence = (best - mean) / np.maximum(deviation, QUANTA)
     middles = np.column_stack([columns + 0.5, rows + 0.5]) * level.cell_m
-    chosen = _apart(middles, best.astype(np.float64), most, apart_m)
+    highest = _apart(middles, best.astype(np.float64), (most + 1) // 2, apart_m)
+    chosen = _apart(middles, prominence, most - len(highest), apart_m, highest)
     poses = np.column_stack([middles[chosen], angles[heading[chosen]]])
-    return Peaks(poses, best[chosen] / QUANTA)
+    return Peaks(poses, best[chosen] / QUANTA, prominence[chosen])
+
+
+def _around_cells(
+    rows: Int64Array, columns: Int64Array, mean: Float64Array, mean_square: Float64Array, cell_m: float
+) -> tuple[Float64Array, Float64Array]:
+    """Return mean and standard deviation (n,) of the scores in the square of `_AROUND_M` around each of n cells.
+
+    `mean` and `mean_square` (n,): over all headings at each cell. Cells that were not searched count for nothing.
+    """
+    top, left = int(rows.min()), int(columns.min())
+    shape = (3, int(rows.max()) - top + 1, int(columns.max()) - left + 1)
+    grids = np.zeros(shape)
+    at = (rows - top, columns - left)
+    for grid, values in zip(grids, (np.ones(len(rows)), mean, mean_square), strict=True):
+        grid[at] = values
+    side = 2 * round(0.5 * _AROUND_M / cell_m) + 1
+    count, first, second = (ndimage.uniform_filter(grid, side, mode="constant")[at] for grid in grids)
+    average = np.asarray(first / count)
+    return average, np.sqrt(np.maximum(second / count - average**2, 0.0))
 
 
 def climb(
@@ -90,8 +139,8 @@ def climb(
         )
         return found
 
-    found, scores, converged = _in_parts(part, poses, pool)
-    return Peaks(found, scores), converged
+    found, scores, converged = in_parts(part, poses, pool)
+    return Peaks(found, scores, np.zeros(len(scores))), converged
 
 
 def scores_at(
@@ -103,7 +152,7 @@ def scores_at(
     def part(some: Float64Array) -> tuple[Float64Array]:
         return (_scores(likelihood.classes, likelihood.model.log_ratios, xy, evidence.channel, some, CELL_M),)
 
-    return np.asarray(_in_parts(part, poses, pool)[0])
+    return np.asarray(in_parts(part, poses, pool)[0])
 
 
 def local_search(
@@ -135,15 +184,22 @@ def local_search(
         )
         return found
 
-    found, scores = _in_parts(part, poses, pool)
-    return Peaks(found, scores / QUANTA)
+    def surroundings(some: Float64Array) -> tuple[Float64Array]:
+        return (_level_scores(level.ratios, xy, evidence.channel, level.cell_m, some, LAYERS),)
+
+    if not len(poses):
+        return no_peaks()
+    found, scores = in_parts(part, poses, pool)
+    around = in_parts(surroundings, (found[:, None] + TURNED).reshape(-1, 3), pool)[0].reshape(len(found), -1)
+    prominence = (scores - around.mean(axis=1)) / np.maximum(around.std(axis=1), QUANTA)
+    return Peaks(found, scores / QUANTA, prominence)
 
 
-def merge(peaks: Peaks, apart_m: float, apart_rad: float) -> Int64Array:
-    """Return which peaks to keep, best first: one of those nearer than both to a better one."""
-    near = are_near(peaks.poses, apart_m, apart_rad)
+def merge(poses: Float64Array, order: Int64Array, apart_m: float, apart_rad: float) -> Int64Array:
+    """Return which poses (p, 3) to keep, in an order, best first: none that is nearer than both to a better one."""
+    near = are_near(poses, apart_m, apart_rad)
     kept: list[int] = []
-    for i in np.argsort(-peaks.scores, kind="stable"):
+    for i in order:
         if not near[i, kept].any():
             kept.append(int(i))
     return np.array(kept, np.int64)
@@ -194,22 +250,24 @@ def inside(likelihood: MapLikelihood, level: Level) -> Int64Array:
     return np.column_stack([along, np.full(len(along), across[0]), np.full(len(along), len(across))])
 
 
-def _in_parts(
-    work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, pool: ThreadPool
-) -> tuple[Any, ...]:
+def in_parts(work: Callable[[Float64Array], tuple[Any, ...]], poses: Float64Array, pool: ThreadPool) -> tuple[Any, ...]:
     """Return what `work` gives for poses (p, 3), divided among the threads: arrays of p rows."""
     poses = np.ascontiguousarray(poses, np.float64)
     parts = np.array_split(poses, max(min(pool.threads, len(poses)), 1))
     return tuple(np.concatenate(results) for results in zip(*pool.map(work, parts), strict=True))
 
 
-def _apart(middles: Float64Array, scores: Float64Array, most: int, apart_m: float) -> Int64Array:
-    """Return the best of the cells' middles (n, 2), greedily, each `apart_m` from those before."""
+def _apart(
+    middles: Float64Array, scores: Float64Array, most: int, apart_m: float, chosen: Int64Array | None = None
+) -> Int64Array:
+    """Return the best of the cells' middles (n, 2), greedily, each `apart_m` from those before, the `chosen` first."""
     candidates = min(len(scores), _CONSIDERED * most)
     order = np.argpartition(-scores, candidates - 1)[:candidates]
     order = order[np.argsort(-scores[order], kind="stable")]
-    chosen: Int64Array = _greedy(np.ascontiguousarray(middles[order]), most, apart_m)
-    return order[chosen]
+    before = np.empty(0, np.int64) if chosen is None else chosen
+    order = np.concatenate([before, order])
+    found: Int64Array = _greedy(np.ascontiguousarray(middles[order]), len(before) + most, apart_m)
+    return order[found]
 
 
 @njit(cache=True, nogil=True)
@@ -236,15 +294,17 @@ def _correlate(  # type: ignore[no-untyped-def]
     ratios: Int16Array, xy: Float64Array, channel: Int64Array, cell: float, angles: Float64Array, runs: Int64Array,
     layers: int,
 ):  # fmt: skip
-    """Return the best score and its heading's number for every cell of the runs, one after the other."""
+    """Return for every cell of the runs, one after the other: the best score and its heading's number, sum and sum of
+    squares over the headings."""
     _, rows, columns = ratios.shape
     flat = ratios.reshape(-1)
-    total, widest = 0, 0
+    cells, widest = 0, 0
     for k in range(len(runs)):
-        total += runs[k, 2]
+        cells += runs[k, 2]
         widest = max(widest, runs[k, 2])
-    best = np.full(total, -32768, np.int16)
-    heading = np.zeros(total, np.int16)
+    best = np.full(cells, -32768, np.int16)
+    heading = np.zeros(cells, np.int16)
+    total, squares = np.zeros(cells), np.zeros(cells)
     sums = np.zeros(widest, np.int16)
     offsets = np.empty(len(channel), np.int64)
     for h in range(len(angles)):
@@ -267,11 +327,14 @@ def _correlate(  # type: ignore[no-untyped-def]
                 for j in range(width):
                     sums[j] += line[j]
             for j in range(width):
-                if sums[j] > best[at + j]:
-                    best[at + j] = sums[j]
+                score = sums[j]
+                total[at + j] += score
+                squares[at + j] += np.float64(score) * score
+                if score > best[at + j]:
+                    best[at + j] = score
                     heading[at + j] = h
             at += width
-    return best, heading
+    return best, heading, total, squares
 
 
 @njit(cache=True, nogil=True)
@@ -307,6 +370,26 @@ def _local(  # type: ignore[no-untyped-def]
                         found[p, 2] = angle
         scores[p] = best
     return found, scores
+
+
+@njit(cache=True, nogil=True)
+def _level_scores(  # type: ignore[no-untyped-def]
+    ratios: Int16Array, xy: Float64Array, channel: Int64Array, cell: float, poses: Float64Array, layers: int
+):  # fmt: skip
+    """Return the scores (p,) of poses (p, 3) in the cells of a level, in its quanta."""
+    _, rows, columns = ratios.shape
+    scores = np.zeros(len(poses))
+    for p in range(len(poses)):
+        c, s = math.cos(poses[p, 2]), math.sin(poses[p, 2])
+        total = 0
+        for e in range(len(channel)):
+            x, y = poses[p, 0] + c * xy[e, 0] - s * xy[e, 1], poses[p, 1] + s * xy[e, 0] + c * xy[e, 1]
+            middle = 0.0 if channel[e] < layers else 0.5
+            column, row = math.floor(x / cell - middle), math.floor(y / cell - middle)
+            if 0 <= row < rows and 0 <= column < columns:
+                total += ratios[channel[e], row, column]
+        scores[p] = total
+    return scores
 
 
 @njit(cache=True, nogil=True)

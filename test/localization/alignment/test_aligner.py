@@ -19,7 +19,7 @@ from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.localization.alignment import aligner as alignment
-from crossloc3d_ros.localization.alignment.aligner import Aligner, fine_counts
+from crossloc3d_ros.localization.alignment.aligner import Aligner
 from crossloc3d_ros.types import (
     WHOLE_MAP,
     AlignedPoses,
@@ -347,9 +347,3 @@ def test_headings_are_wrapped_with_west_at_pi() -> None:
     np.testing.assert_allclose(headings, [0.0, 0.0, math.pi, math.pi, 7.0 - 2 * math.pi])
     assert headings[2] == headings[3] == math.pi
     assert not np.signbit(headings[:2]).any()
-
-
-def test_counts_are_those_that_scores_are_summed_over(scan: PreparedScan) -> None:
-    counts = fine_counts(scan, BASE)
-    assert 100 < counts[: len(counts) // 2].sum() <= 2000
-    assert 100 < counts[len(counts) // 2 :].sum() <= 3000

@@ -17,6 +17,7 @@ from crossloc3d_ros.localization.alignment.likelihood import LEVELS_M, QUANTA, M
 from crossloc3d_ros.localization.alignment.observation_model import (
     CLASSES,
     MARGIN_CELLS,
+    MEASURES,
     UNKNOWN,
     ObservationModel,
     surface_classes,
@@ -26,7 +27,7 @@ from crossloc3d_ros.types import Float32Array
 
 _RATIOS = np.random.default_rng(0).uniform(-3, 3, (2, CHANNELS, CLASSES)).astype(np.float32)
 _RATIOS[:, :, UNKNOWN] = 0.0
-MODEL = ObservationModel(*_RATIOS, np.ones(CHANNELS))
+MODEL = ObservationModel(*_RATIOS, np.full(LAYERS, 0.5), np.zeros(len(MEASURES) + 1))
 Maker = Callable[..., AerialMap]
 
 

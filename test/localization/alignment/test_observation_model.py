@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from crossloc3d_ros.localization.alignment.observation_model import (
     HEIGHTS_M,
     HOLE,
     MARGIN_CELLS,
+    MEASURES,
+    PATTERNS,
+    SUPPORT_BOUNDS,
     UNKNOWN,
     ObservationModel,
     fit_log_ratios,
@@ -50,13 +54,28 @@ def in_a_hole(known: npt.NDArray[np.bool_], i: int, j: int) -> bool:
     return bool((((middles[:, None] - places[None]) ** 2).sum(axis=2).min(axis=1) <= 20**2).all())
 
 
+def support_by_hand(known: npt.NDArray[np.bool_], i: int, j: int) -> int:
+    """Return how many of the bounds the share of surveyed cells with an echo around a cell falls short of."""
+    rows, columns = slice(max(i - 5, 0), i + 6), slice(max(j - 5, 0), j + 6)
+    surveyed = [
+        known[r, c] or in_a_hole(known, r, c)
+        for r in range(*rows.indices(len(known)))
+        for c in range(*columns.indices(len(known)))
+    ]
+    share = known[rows, columns].sum() / max(sum(surveyed), 1)
+    return int(2 - np.digitize(share, SUPPORT_BOUNDS))
+
+
 def gaps_filled(above: Float32Array) -> Float32Array:
-    """Return the heights with every gap that has known neighbours at their mean."""
-    filled = above.copy()
-    for i, j in np.argwhere(~np.isfinite(above)):
-        around = above[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-        if np.isfinite(around).any() and in_a_hole(np.isfinite(above), i, j):
-            filled[i, j] = np.nanmean(around)
+    """Return the heights with every gap at the mean of its known neighbours: once where echoes are dense, else again."""
+    was_known, filled = np.isfinite(above), above.copy()
+    for step in range(3):
+        before = filled.copy()
+        for i, j in np.argwhere(~np.isfinite(before)):
+            around = before[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+            dense_enough = support_by_hand(was_known, i, j) >= step
+            if np.isfinite(around).any() and in_a_hole(was_known, i, j) and dense_enough:
+                filled[i, j] = np.nanmean(around)
     return filled
 
 
@@ -75,12 +94,13 @@ def class_by_hand(
         sum(v >= step for step in HEIGHTS_M) for v in (above[i, j], np.nanmin(beside), np.nanmax(beside))
     )
     openness = next((reach for reach in range(3) if around(reached, reach).any()), 3)
-    return int(((here * STEPS + low) * STEPS + high) * 4 + openness)
+    pattern = ((here * STEPS + low) * STEPS + high) * 4 + openness
+    return int(support_by_hand(was_known, i, j) * PATTERNS + pattern)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
-    terrain, surface, lowest = heights(seed)
+@pytest.mark.parametrize("holes", [0.02, 0.2, 0.7])
+def test_classes_are_those_of_each_cell_s_neighbours(holes: float) -> None:
+    terrain, surface, lowest = heights(1, holes)
     classes = surface_classes(terrain, surface, lowest)
     above = surface - terrain
     filled, known, reached = gaps_filled(above), np.isfinite(above), lowest - terrain < 1.0
@@ -89,6 +109,7 @@ def test_classes_are_those_of_each_cell_s_neighbours(seed: int) -> None:
     assert len(np.unique(classes)) > 50
     assert (classes[np.isnan(filled)] >= HOLE).all()
     assert (classes[~known] < HOLE).any()
+    assert set(np.unique(classes[classes < HOLE] // PATTERNS)) <= {0.02: {0, 1}, 0.2: {0, 1, 2}, 0.7: {2}}[holes]
     assert 0 <= classes.min() <= classes.max() < CLASSES
 
 
@@ -148,7 +169,7 @@ def test_known_shares_are_recovered() -> None:
     beams = rng.integers(200_000, 400_000, (LAYERS, CLASSES)).astype(float)
     here = np.concatenate([share * beams, (1.0 - share) * beams])
     elsewhere = here * np.where(CLOSED, rng.uniform(1.0, 9.0, CLASSES), 1.0)
-    full, ratios, expected = fit_log_ratios(here, elsewhere)
+    full, ratios, hit_share = fit_log_ratios(here, elsewhere)
     overall = (share * beams).sum(axis=1) / beams.sum(axis=1)
     known = np.arange(CLASSES) != UNKNOWN
     p = np.exp(ratios[:LAYERS]) * overall[:, None]
@@ -162,7 +183,7 @@ def test_known_shares_are_recovered() -> None:
     assert (rarer[:, CLOSED] < -1.0).any()
     np.testing.assert_allclose(full, np.clip(ratios + np.tile(refuting, (2, 1)), -3.0, 3.0), atol=0.02)
     assert (ratios[:, UNKNOWN] == 0.0).all() and (full[:, UNKNOWN] == 0.0).all()
-    np.testing.assert_allclose(expected, (here * full).sum(axis=1) / here.sum(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(hit_share, overall, rtol=1e-9)
 
 
 def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> None:
@@ -177,7 +198,34 @@ def test_a_class_that_was_hardly_seen_says_little_and_none_says_too_much() -> No
     assert 0.0 < ratios[0, 1] < 0.05
     assert -0.1 < full[0, 6] < 0.0
     assert max(np.abs(ratios).max(), np.abs(full).max()) <= 3.0
-    np.testing.assert_allclose(ratios[:, 6:], 0.0, atol=1e-6)
+    np.testing.assert_allclose(ratios[:, 6:PATTERNS], 0.0, atol=1e-6)
+
+
+def test_a_pattern_that_is_rare_in_sparse_surveys_is_taken_as_in_dense_ones() -> None:
+    here = np.zeros((CHANNELS, CLASSES))
+    here[:LAYERS, 0], here[LAYERS:, 0] = 1e6, 1e6
+    here[:LAYERS, 7], here[LAYERS:, 7] = 9e5, 1e5  # mostly hit where echoes are dense
+    here[:LAYERS, 2 * PATTERNS + 7] = 1.0
+    here[:LAYERS, PATTERNS + 7], here[LAYERS:, PATTERNS + 7] = 1e5, 9e5  # and not in between, as is well known
+    _, ratios, _ = fit_log_ratios(here, here)
+    assert ratios[0, 2 * PATTERNS + 7] == pytest.approx(ratios[0, 7], abs=0.2)
+    assert ratios[0, PATTERNS + 7] < -1.0
+
+
+def test_expectations_are_the_means_under_either_hypothesis() -> None:
+    rng = np.random.default_rng(0)
+    here = rng.uniform(1e3, 1e5, (CHANNELS, CLASSES))
+    full, ratios, hit_share = fit_log_ratios(here, here)
+    shipped = ObservationModel(full, ratios, hit_share, np.zeros(len(MEASURES) + 1))
+    at_true, of_others = shipped.expectations
+    p = here[:LAYERS] / (here[:LAYERS] + here[LAYERS:])
+    q = here[:LAYERS].sum(axis=1, keepdims=True) / (here[:LAYERS] + here[LAYERS:]).sum(axis=1, keepdims=True)
+    known = np.arange(CLASSES) != UNKNOWN
+    for found, share in ((at_true, p), (of_others, np.broadcast_to(q, p.shape))):
+        mean = share * full[:LAYERS] + (1.0 - share) * full[LAYERS:]
+        np.testing.assert_allclose(found[:, known], mean[:, known], atol=0.01)
+    open_ = known & ~CLOSED
+    assert (at_true[:, open_] >= -1e-4).all() and (of_others[:, open_] <= 1e-4).all(), "Kullback-Leibler divergences"
 
 
 @pytest.mark.parametrize("never", ["a hit", "free space", "anything"])
@@ -187,18 +235,18 @@ def test_a_layer_in_which_nothing_happened_says_nothing(never: str) -> None:
         here[LAYERS - 1] = 0.0
     if never in ("free space", "anything"):
         here[CHANNELS - 1] = 0.0
-    full, ratios, expected = fit_log_ratios(here, here)
+    full, ratios, hit_share = fit_log_ratios(here, here)
     for values in (full, ratios):
         assert np.isfinite(values).all()
         np.testing.assert_allclose(values[[LAYERS - 1, CHANNELS - 1]], 0.0, atol=1e-6)
         assert np.abs(values[0]).max() > 0.1
-    assert np.isfinite(expected).all()
+    assert ((hit_share > 0.0) & (hit_share < 1.0)).all()
 
 
 def model(seed: int = 0) -> ObservationModel:
     rng = np.random.default_rng(seed)
     ratios = rng.uniform(-3, 3, (2, CHANNELS, CLASSES)).astype(np.float32)
-    return ObservationModel(ratios[0], ratios[1], rng.uniform(0, 1, CHANNELS), 0.37, 12.5)
+    return ObservationModel(ratios[0], ratios[1], rng.uniform(0, 1, LAYERS), rng.uniform(0, 9, len(MEASURES) + 1))
 
 
 def test_a_model_comes_back_from_its_file_as_it_was(tmp_path: Path) -> None:
@@ -207,16 +255,15 @@ def test_a_model_comes_back_from_its_file_as_it_was(tmp_path: Path) -> None:
     read = ObservationModel.load(path)
     np.testing.assert_array_equal(read.log_ratios, made.log_ratios)
     np.testing.assert_array_equal(read.search_ratios, made.search_ratios)
-    np.testing.assert_array_equal(read.expected, made.expected)
-    assert (read.expected_share, read.temperature) == (0.37, 12.5)
+    np.testing.assert_array_equal(read.hit_share, made.hit_share)
+    np.testing.assert_array_equal(read.weights, made.weights)
 
 
-def test_half_of_the_expected_score_leaves_it_open() -> None:
-    shipped = dataclasses.replace(model(), expected_share=0.5, temperature=4.0)
-    counts = np.arange(CHANNELS) * 10
-    expected = float(shipped.expected @ counts)
-    found = shipped.log_likelihood(np.array([0.0, 0.5, 1.0]) * expected, counts)
-    np.testing.assert_allclose(found, np.array([-0.5, 0.0, 0.5]) * expected / 4.0)
+def test_the_log_likelihood_is_the_weighted_sum_of_the_measures_and_a_constant() -> None:
+    weighing = dataclasses.replace(model(), weights=np.array([2.0, 3.0, 5.0, -7.0]))
+    found = weighing.log_likelihood(np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 2.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(found, [-5.0, 7.0, -7.0])
+    assert (ObservationModel.load().weights[:-1] >= 0.0).all(), "what fits better is never less likely"
 
 
 def test_the_shipped_model_knows_that_beams_hit_walls() -> None:
@@ -231,7 +278,20 @@ def test_the_shipped_model_knows_that_beams_hit_walls() -> None:
 
 @pytest.mark.parametrize(
     "damage",
-    ["missing", "empty", "text", "cut", "other shape", "no calibration", "NaN", "too steep", "temperature", "folder"],
+    [
+        "missing",
+        "empty",
+        "text",
+        "cut",
+        "other shape",
+        "no measures",
+        "other measures",
+        "NaN",
+        "too steep",
+        "weights",
+        "share",
+        "folder",
+    ],
 )
 def test_a_file_that_is_no_model_is_named(tmp_path: Path, damage: str) -> None:
     path = tmp_path / f"{damage}.safetensors"
@@ -248,21 +308,28 @@ def test_a_file_that_is_no_model_is_named(tmp_path: Path, damage: str) -> None:
             {
                 "log_ratios": made.log_ratios[:, :-1].copy(),
                 "search_ratios": made.search_ratios,
-                "expected": made.expected,
+                "hit_share": made.hit_share,
+                "weights": made.weights,
             },
             path,
-            {"calibration": "{}"},
+            {"measures": json.dumps(MEASURES)},
         )
-    elif damage == "no calibration":
-        save_file({"log_ratios": made.log_ratios, "search_ratios": made.search_ratios, "expected": made.expected}, path)
+    elif damage == "no measures":
+        save_file({name: getattr(made, name) for name in ("log_ratios", "search_ratios", "hit_share", "weights")}, path)
+    elif damage == "other measures":
+        made.save(path)
+        tensors = {name: getattr(made, name) for name in ("log_ratios", "search_ratios", "hit_share", "weights")}
+        save_file(tensors, path, {"measures": json.dumps(["score"])})
     elif damage == "NaN":
         made.log_ratios[2, 5] = np.nan
         made.save(path)
     elif damage == "too steep":
         made.search_ratios[2, 5] = 50.0
         made.save(path)
-    elif damage == "temperature":
-        dataclasses.replace(made, temperature=0.0).save(path)
+    elif damage == "weights":
+        dataclasses.replace(made, weights=made.weights * np.inf).save(path)
+    elif damage == "share":
+        dataclasses.replace(made, hit_share=np.zeros(LAYERS)).save(path)
     elif damage == "folder":
         path.mkdir()
     with pytest.raises(CrossLocError, match="is not an observation model of this version") as raised:

@@ -16,7 +16,6 @@ from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evi
 from crossloc3d_ros.localization.alignment.likelihood import QUANTA, Level, MapLikelihood
 from crossloc3d_ros.localization.alignment.observation_model import ObservationModel
 from crossloc3d_ros.localization.alignment.pose_search import (
-    Peaks,
     around,
     climb,
     inside,
@@ -95,7 +94,6 @@ def test_the_search_of_cells_finds_what_trying_all_poses_finds(cell_m: float, he
         scores = [laid(evidence, level, x, y, 2 * math.pi * h / headings) for h in range(headings)]
         table[x, y] = max(scores), 2 * math.pi * int(np.argmax(scores)) / headings
     assert len(found.poses) == len(table)
-    assert (np.diff(found.scores) <= 0).all()
     for (x, y, angle), score in zip(found.poses, found.scores, strict=True):
         best, heading = table.pop((x, y))
         assert score * QUANTA == best
@@ -107,12 +105,48 @@ def test_peaks_are_apart_and_no_better_one_is_left_out() -> None:
     cells = np.zeros(SHAPE, np.bool_)
     cells[12:28, 12:34] = True
     every = search_cells(evidence, level, runs_of(cells), 6, 10**4, 0.1)
-    few = search_cells(evidence, level, runs_of(cells), 6, 5, 11.0)
+    few = search_cells(evidence, level, runs_of(cells), 6, 9, 11.0)
     chosen: list[np.ndarray] = []
-    for pose in every.poses:
-        if all(np.hypot(*(pose[:2] - other[:2])) >= 11.0 for other in chosen):
-            chosen.append(pose)
-    np.testing.assert_array_equal(few.poses, chosen[:5])
+    for values, most in ((every.scores, 5), (every.prominence, 9)):
+        for pose in every.poses[np.argsort(-values, kind="stable")]:
+            if len(chosen) < most and all(np.hypot(*(pose[:2] - other[:2])) >= 11.0 for other in chosen):
+                chosen.append(pose)
+    np.testing.assert_array_equal(few.poses, chosen)
+
+
+def test_prominence_is_the_height_over_the_cells_around_in_all_headings() -> None:
+    level, evidence, headings = some_level(4.0), some_evidence(4.0), 5
+    cells = np.zeros(SHAPE, np.bool_)
+    cells[12:28, 12:34] = np.random.default_rng(3).random((16, 22)) < 0.8
+    found = search_cells(evidence, level, runs_of(cells), headings, 10**4, 0.1)
+    scores = {
+        (row, column): [
+            laid(evidence, level, 4.0 * (column + 0.5), 4.0 * (row + 0.5), 2 * math.pi * h / headings)
+            for h in range(headings)
+        ]
+        for row, column in np.argwhere(cells).tolist()
+    }
+    for (x, y, _), score, prominence in zip(found.poses[:20], found.scores, found.prominence, strict=False):
+        row, column = int(y // 4.0), int(x // 4.0)
+        around = np.concatenate([v for (r, c), v in scores.items() if abs(r - row) <= 6 and abs(c - column) <= 6])
+        assert prominence == pytest.approx((score * QUANTA - around.mean()) / max(around.std(), QUANTA), rel=1e-6)
+
+
+def test_a_place_that_explains_everything_does_not_hide_one_that_fits() -> None:
+    """Half of the area explains any evidence from anywhere; the one pose that fits lies in the other half."""
+    rng = np.random.default_rng(0)
+    level = Level(4.0, rng.integers(-9, 10, (CHANNELS, *SHAPE)).astype(np.int16))
+    evidence = some_evidence(4.0, 120)
+    cells = np.zeros(SHAPE, np.bool_)
+    cells[10:30, 10:36] = True
+    for channel, (x, y) in zip(evidence.channel, evidence.xy_m, strict=True):
+        level.ratios[index_of(level, channel, 4.0 * 28.5 + x, 4.0 * 20.5 + y)] = 9
+    level.ratios[:, :, :22] = 14 + rng.integers(-1, 2, level.ratios[:, :, :22].shape)
+    found = search_cells(evidence, level, runs_of(cells), 12, 4, 8.0)
+    assert (np.argsort(-found.scores)[:2] < 2).all(), "the first half is by score"
+    fits = np.hypot(*(found.poses[:, :2] - [4.0 * 28.5, 4.0 * 20.5]).T) < 1.0
+    assert not fits[:2].any() and fits[2], "the pose that fits is the most prominent one"
+    assert found.by_both()[:2].tolist() == [0, 2], "by turns"
 
 
 @pytest.mark.parametrize("threads", [2, 3, 16])
@@ -126,6 +160,7 @@ def test_threads_change_nothing(threads: int) -> None:
     )
     np.testing.assert_array_equal(one.poses, many.poses)
     np.testing.assert_array_equal(one.scores, many.scores)
+    np.testing.assert_array_equal(one.prominence, many.prominence)
 
 
 @pytest.mark.parametrize("threads", [2, 5, 64])
@@ -230,8 +265,8 @@ def test_scores_are_sums_over_the_cells_that_evidence_falls_on(likelihood: MapLi
 
 def test_poses_are_one_where_both_place_and_heading_are_near() -> None:
     poses = np.array([[0, 0, 3.1], [2.0, 0, -3.1], [2.0, 0, 0.0], [5.0, 0, 3.1], [0.5, 0, 3.0]], float)
-    assert merge(Peaks(poses, np.array([5.0, 4.0, 3.0, 2.0, 9.0])), 3.0, 0.2).tolist() == [4, 2, 3]
-    assert merge(Peaks(np.empty((0, 3)), np.empty(0)), 3.0, 0.2).tolist() == []
+    assert merge(poses, np.array([4, 0, 1, 2, 3]), 3.0, 0.2).tolist() == [4, 2, 3]
+    assert merge(np.empty((0, 3)), np.empty(0, np.int64), 3.0, 0.2).tolist() == []
 
 
 @pytest.mark.parametrize("quarter", [1, 2, 3])
