@@ -91,7 +91,7 @@ def park(tmp_path: Path) -> Path:
     xy = rng.uniform(0, 120, (170_000, 2))
     huts = rng.uniform(5, 115, (40, 2))
     inside = (np.abs(xy[:, None] - huts[None]).max(axis=2) < 3.0).any(axis=1)
-    points = np.column_stack([xy + [400_000.0, 5_300_000.0], np.where(inside, 4.0, 0.0) + rng.normal(0, 0.02, len(xy))])
+    points = np.column_stack([xy + np.array([4e5, 5.3e6]), np.where(inside, 4.0, 0.0) + rng.normal(0, 0.02, len(xy))])
     write_laz(tmp_path / "park.laz", points, np.where(inside, 6, 2).astype(np.uint8), "EPSG:32632", scale=0.001)
     return tmp_path / "park.laz"
 
