@@ -27,6 +27,8 @@ from crossloc3d_ros.datasets.pose_drives import Journey, Leg, journeys_of, steps
 _CODE = ("aerial_map", "clouds", "config", "encoder", "localization", "weights")
 """Packages that decide what is estimated for a scan."""
 _QUICK_SEED = 0
+_SINGLES_AT_ONCE = 60
+"""Single scans of a piece: a minute of work, and so the most that a run which is stopped loses."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def pieces_of(sets: BeliefSets, every: int = 1) -> list[Piece]:
     `every`: for a quick look, each n-th scan and journey of each set on its map, and one of n drives off the map, drawn
     by lot so that each map has some.
     """
-    pieces = [piece for each in sets.on_map for piece in (*_singles(each, sets, every), *_journeys(each, sets, every))]
+    pieces = [piece for each in sets.on_map for piece in (*_singles(each, every), *_journeys(each, every))]
     off = _off_map(sets)
     chosen = np.random.default_rng(_QUICK_SEED).permutation(len(off))[: -(-len(off) // every)]
     pieces += [off[i] for i in np.sort(chosen).tolist()]
@@ -85,7 +87,7 @@ def pieces_of(sets: BeliefSets, every: int = 1) -> list[Piece]:
     return sorted(pieces, key=lambda piece: (order[piece.map_folder], -piece.scans))
 
 
-def _about(each: BeliefSet, sets: BeliefSets, drive: str, number: str) -> PieceAbout:
+def _about(each: BeliefSet, drive: str, number: str) -> PieceAbout:
     name = f"{each.name} {each.condition.name} {number}"
     return PieceAbout(
         _file_name(name), True, each.name, each.name, each.condition.name, drive, each.pose_set.area_names,
@@ -93,36 +95,39 @@ def _about(each: BeliefSet, sets: BeliefSets, drive: str, number: str) -> PieceA
     )  # fmt: skip
 
 
-def _singles(each: BeliefSet, sets: BeliefSets, every: int) -> list[Piece]:
+def _singles(each: BeliefSet, every: int) -> list[Piece]:
     chosen = np.arange(0, len(each.pose_set.scans), every)
     areas = each.pose_set.scans.area[chosen]
     pieces = []
-    for area in np.unique(areas).tolist():
-        if each.pose_set.on_map[area]:
-            rows = tuple(chosen[areas == area].tolist())
-            about = _about(each, sets, each.pose_set.area_names[area], f"scans {area:02d} each {every}")
+    for area in (area for area in np.unique(areas).tolist() if each.pose_set.on_map[area]):
+        rows = chosen[areas == area].tolist()
+        for first in range(0, len(rows), _SINGLES_AT_ONCE):
+            part = tuple(rows[first : first + _SINGLES_AT_ONCE])
+            number = f"scans {area:02d} from {first:03d} each {every}"
+            about = _about(each, each.pose_set.area_names[area], number)
             where = (each.pose_set.folder, each.pose_set.map_folder)
-            pieces.append(Piece(about, *where, each.condition, None, rows, len(rows)))
+            pieces.append(Piece(about, *where, each.condition, None, part, len(part)))
     return pieces
 
 
-def _journeys(each: BeliefSet, sets: BeliefSets, every: int) -> list[Piece]:
+def _journeys(each: BeliefSet, every: int) -> list[Piece]:
     pieces = []
     journeys = journeys_of(each.pose_set, each.drives)
     on_map = [j for j in journeys if each.pose_set.on_map[each.drives[j.legs[0].drive].plan.area]]
     for i, journey in enumerate(on_map[::every]):
         started = each.condition.started(journey)
         drive = each.drives[started.legs[0].drive].plan.name
-        about = _about(each, sets, drive, f"journey {i * every:02d}")
+        about = _about(each, drive, f"journey {i * every:02d}")
         pieces.append(_driven(about, each, each.pose_set.map_folder, started))
     return pieces
 
 
 def _off_map(sets: BeliefSets) -> list[Piece]:
-    """Return every drive of every set on every map that it keeps off."""
+    """Return every drive on every map that it keeps off: of sets learned on too where there are no others."""
     pieces = []
     maps = {folder: AerialMap.load(folder) for folder in dict.fromkeys(_map_folders(sets))}
-    for each in (each for each in sets.on_map if each.condition == DELIVERED):
+    delivered = [each for each in sets.on_map if each.condition == DELIVERED]
+    for each in [each for each in delivered if not each.is_learned] or delivered:
         for number, drive in enumerate(each.drives):
             for target in sets.maps:
                 if not are_apart(maps[target.folder], maps[each.pose_set.map_folder], drive):
