@@ -97,6 +97,7 @@ def park(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_belief_is_predicted_piece_by_piece_and_scored_again(
     weights: Path, park: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ from crossloc3d_ros.evaluation.belief.pieces import pieces_of
 from crossloc3d_ros.evaluation.belief.predictions import load_pieces, predict_pieces
 from crossloc3d_ros.evaluation.belief.report import CSV, JSON, MARKDOWN, PAGE, write_report
 from crossloc3d_ros.evaluation.belief.scores import score_belief
-from crossloc3d_ros.evaluation.belief.terminal import belief_tables
+from crossloc3d_ros.evaluation.belief.terminal import WIDTH, belief_tables
 from crossloc3d_ros.formats.las import expand_inputs
 
 
@@ -39,6 +39,8 @@ def evaluate_belief(arguments: argparse.Namespace) -> None:
     scores = score_belief(predictions, about)
     write_report(output, scores, len(predictions.rows))
     results = Console(highlight=False)
+    if not results.is_terminal:
+        results = Console(highlight=False, width=WIDTH)
     for table in belief_tables(scores):
         results.print(table)
     print("\n".join(str(output / name) for name in (CSV, JSON, MARKDOWN)))

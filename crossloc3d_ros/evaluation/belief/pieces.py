@@ -74,7 +74,7 @@ class Piece:
 
 
 def pieces_of(sets: BeliefSets, every: int = 1) -> list[Piece]:
-    """Return all pieces, map by map, the longest of each map first.
+    """Return all pieces: set by set on their maps, then off the map.
 
     `every`: for a quick look, each n-th scan and journey of each set on its map, and one of n drives off the map, drawn
     by lot so that each map has some.
@@ -82,7 +82,11 @@ def pieces_of(sets: BeliefSets, every: int = 1) -> list[Piece]:
     pieces = [piece for each in sets.on_map for piece in (*_singles(each, every), *_journeys(each, every))]
     off = _off_map(sets)
     chosen = np.random.default_rng(_QUICK_SEED).permutation(len(off))[: -(-len(off) // every)]
-    pieces += [off[i] for i in np.sort(chosen).tolist()]
+    return pieces + [off[i] for i in np.sort(chosen).tolist()]
+
+
+def in_order_of_work(pieces: Sequence[Piece]) -> list[Piece]:
+    """Return pieces map by map, as each process holds one, and the longest of each map first."""
     order = {folder: i for i, folder in enumerate(dict.fromkeys(piece.map_folder for piece in pieces))}
     return sorted(pieces, key=lambda piece: (order[piece.map_folder], -piece.scans))
 

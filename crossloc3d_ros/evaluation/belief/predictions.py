@@ -16,7 +16,7 @@ from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.set_maps import Progress
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.evaluation.belief.climbing import COLUMN, Climber
-from crossloc3d_ros.evaluation.belief.pieces import Piece, PieceAbout, code_digest, settings_of
+from crossloc3d_ros.evaluation.belief.pieces import Piece, PieceAbout, code_digest, in_order_of_work, settings_of
 from crossloc3d_ros.evaluation.poses.predictions import (
     PosePredictions,
     drives_of,
@@ -87,7 +87,7 @@ def predict_pieces(
     )
     tasks = [
         _Task(piece, output / PIECES / f"{piece.about.name}.npz", config, settings)
-        for piece in pieces
+        for piece in in_order_of_work(pieces)
         for settings in [settings_of(piece, config, encoder.fingerprint, code)]
     ]
     missing = [task for task in tasks if not _is_made(task)]

@@ -9,6 +9,10 @@ from crossloc3d_ros.evaluation.belief.scores import BeliefScores
 from crossloc3d_ros.evaluation.poses.terminal import goal_table
 from crossloc3d_ros.pages.terminal import plain_table
 
+_NAME_WIDTH = 24
+WIDTH = 150
+"""Columns that the tables need where the output goes to a file."""
+
 
 def belief_tables(scores: BeliefScores) -> list[Table]:
     """Return what the terminal shows of belief: the goals, each set on its map, each map with drives from elsewhere."""
@@ -22,4 +26,7 @@ def belief_tables(scores: BeliefScores) -> list[Table]:
     off_map = plain_table("Off the map", MAP_COLUMNS)
     for pair in scores.maps:
         off_map.add_row(*map_cells(pair))
+    for table in (on_map, off_map):
+        table.columns[0].min_width = _NAME_WIDTH
+        table.columns[0].overflow = "fold"
     return [goals, on_map, off_map]
