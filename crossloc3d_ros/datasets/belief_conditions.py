@@ -30,6 +30,11 @@ class Condition:
     """Whether robots are kidnapped at the ends of their drives."""
 
     @property
+    def is_recorded_anew(self) -> bool:
+        """Whether scans and drives are others than those of the pose set."""
+        return self.is_aged
+
+    @property
     def changes_scans(self) -> bool:
         """Whether scans are not taken as they were recorded."""
         return self.every_point > 1 or math.isfinite(self.max_range_m)

@@ -180,8 +180,9 @@ class _Part:
     share: float = 1.0
     """Of the survey's points."""
     plan: DrivePlan | None = None
-    """The drive that is recorded; None: scans, or a thinner survey."""
-    is_aged: bool = False
+    """The drive that is recorded; None: single scans, or a thinner survey."""
+    condition: Condition | None = None
+    """Under which it is scanned; None: a thinner survey."""
 
 
 class _Conditions:
@@ -203,8 +204,8 @@ class _Conditions:
     def of(self, condition: Condition) -> BeliefSet:
         """Return the set under a condition."""
         pose_set, drives = self._pose_set, self._drives
-        if condition.is_aged:
-            pose_set = self._aged()
+        if condition.is_recorded_anew:
+            pose_set = self._recorded(condition)
             drives = tuple(load_drives(pose_set.folder))
         if condition.density_per_m2 is not None:
             pose_set = dataclasses.replace(pose_set, map_folder=self._thinned(condition.density_per_m2))
@@ -228,20 +229,24 @@ class _Conditions:
             inputs = [folder / name for name in names]
             return make_map(folder, inputs, self._poses.examined.build, self._loader, self._workers, self._report)
 
-    def _aged(self) -> PoseSet:
-        """Return the set with its scans and drives in the aged towns, on the map as it was delivered."""
-        folder = self._folder / "aged"
+    def _recorded(self, condition: Condition) -> PoseSet:
+        """Return the set with scans and drives recorded under a condition, on the map as it was delivered."""
+        folder = self._folder / condition.name
         parts, recordings = [], []
         plans = drive_plans(self._pose_set.name)
         for area, survey in enumerate(self._surveys):
-            parts.append(_Part(folder / survey.parent.name, self._settings, self._poses, area, survey, is_aged=True))
+            parts.append(
+                _Part(folder / survey.parent.name, self._settings, self._poses, area, survey, condition=condition)
+            )
             plan = _elsewhere(next(each for each in plans if each.area == area))
             settings = settings_of_plan(plan)
             recordings.append(
-                _Part(folder / DRIVES / f"{area:02d}", settings, self._poses, area, survey, plan=plan, is_aged=True)
+                _Part(
+                    folder / DRIVES / f"{area:02d}", settings, self._poses, area, survey, plan=plan, condition=condition
+                )
             )
         with benchmark.alone(self._folder):
-            self._make([*recordings, *parts], "ageing")
+            self._make([*recordings, *parts], f"recording, {condition.name}")
             towns = self._poses.examined.towns
             write_manifest(
                 folder,
@@ -281,11 +286,11 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
     examined = part.poses.examined
     town = examined.towns[part.area]
     if part.plan is not None:
-        record_drive(part.folder, part.plan, _aged_town(part), part.settings)
+        record_drive(part.folder, part.plan, _world_of(part), part.settings)
     else:
         with whole(part.folder) as partial:
-            if part.is_aged:
-                save_scans(partial, scans_of_town(_aged_town(part), town, examined, examined.queries))
+            if part.condition is not None:
+                save_scans(partial, scans_of_town(_world_of(part), town, examined, examined.queries))
             else:
                 write_part([part.survey], partial / _TOWN_SURVEY, 0.0, part.share)
             mark_made(partial, part.settings)
@@ -293,7 +298,8 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
         advance(1)
 
 
-def _aged_town(part: _Part) -> World:
+def _world_of(part: _Part) -> World:
+    """Return the town that is scanned under the condition of a part."""
     town = part.poses.examined.towns[part.area]
     world, _ = placed_town(town, 1 - town.seed % 2, part.poses.examined.town_size_m, part.poses.corner(part.area))
-    return aged(world, town.seed)
+    return aged(world, town.seed) if part.condition is not None and part.condition.is_aged else world
