@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from crossloc3d_ros.cli.common import ProgressDisplay, add_verbosity, console, run, set_up_logging
+from crossloc3d_ros.cli.modes.evaluate_belief import evaluate_belief
 from crossloc3d_ros.cli.modes.evaluate_poses import evaluate_poses, label_of, loader_of
 from crossloc3d_ros.config import VerificationConfig, from_dict
 from crossloc3d_ros.datasets.amsterdam import find_surveys
@@ -35,7 +36,8 @@ PREDICTIONS = "predictions"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
     arguments = _parser().parse_args(argv)
-    return run(lambda: evaluate_poses(arguments) if arguments.protocol == "pose" else _evaluate(arguments))
+    modes = {"place": _evaluate, "pose": evaluate_poses, "belief": evaluate_belief}
+    return run(lambda: modes[arguments.protocol](arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -43,12 +45,14 @@ def _parser() -> argparse.ArgumentParser:
         prog="evaluate",
         description="Retrieve the places of ground scans among aerial submaps, write the predictions, and score them: "
         "recall at 100, 50 and 25 m with chance level and interval, curves, pictures, one HTML page. With --protocol "
-        "pose, evaluate poses of the whole localizer, of single scans and along drives. An interrupted run continues "
-        "when the same command is given again.",
+        "pose, evaluate poses of the whole localizer, of single scans and along drives; with --protocol belief, its "
+        "probabilities: on thinned and other surveys, with fewer points, in aged towns, and of every drive on every "
+        "map that it is not on. An interrupted run continues when the same command is given again.",
     )
     parser.add_argument(
-        "--protocol", choices=["place", "pose"], default="place",
-        help="place: recall of submaps; pose: metres, degrees, fixes and their covariance (default: %(default)s)",
+        "--protocol", choices=["place", "pose", "belief"], default="place",
+        help="place: recall of submaps; pose: metres, degrees, fixes and their covariance; belief: whether the "
+        "probabilities hold, on the map and off it (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
     parser.add_argument(
@@ -87,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE",
-        help="with --protocol pose: another setting of the localizer, such as fusion.min_probability=0.99",
+        help="with --protocol pose or belief: another setting of the localizer, such as fusion.min_probability=0.99",
     )  # fmt: skip
     parser.add_argument(
         "--odometry", choices=["wheels", "scan", "none"], default="wheels",
@@ -95,9 +99,22 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument(
         "--every", type=int, default=1, metavar="N",
-        help="with --protocol pose, for a quick look: each n-th scan and each n-th journey (default: %(default)s)",
+        help="with --protocol pose or belief, for a quick look: each n-th scan and each n-th journey, and of the pairs "
+        "off the map one of n (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--output", type=Path, help="folder (default: out/evaluate/BENCHMARK or pose_BENCHMARK)")
+    parser.add_argument(
+        "--aerial", nargs="+", type=Path, default=[], metavar="FILE",
+        help="with --protocol belief: further surveys, a file each; each is a map for drives from elsewhere, and one "
+        "of at least 5 points/m2 with ground class is driven through in one half of its points on a map of the other",
+    )  # fmt: skip
+    parser.add_argument(
+        "--learned", nargs="+", type=Path, default=[], metavar="FILE",
+        help="with --protocol belief: the same, of surveys that something was learned or tuned on: shown as such, and "
+        "counted in no total on the map",
+    )  # fmt: skip
+    parser.add_argument(
+        "--output", type=Path, help="folder (default: out/evaluate/BENCHMARK, pose_BENCHMARK or belief_BENCHMARK)"
+    )
     parser.add_argument(
         "--data", type=Path, default=Path("out/benchmark"),
         help="folder in which benchmarks and descriptors are kept (default: %(default)s)",
@@ -119,6 +136,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
     if arguments.set:
         raise ConfigError("--set changes the localizer, which --protocol place does not evaluate: add --protocol pose")
+    if arguments.aerial or arguments.learned:
+        raise ConfigError("--aerial and --learned name surveys for --protocol belief: add it, or leave them out")
     verification = _verification(arguments)
     loader = _loader(arguments)
     encoder = loader()

@@ -31,12 +31,12 @@ from crossloc3d_ros.datasets.pose_sets import (
     AWAY,
     POSE_SETS,
     PoseSet,
-    Progress,
     SimulatedPoses,
     placed_town,
     to_grid,
 )
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
+from crossloc3d_ros.datasets.set_maps import Progress
 from crossloc3d_ros.datasets.simulated import sources_digest
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.formats.bag import open_bag, stamp_ns_of
@@ -271,13 +271,18 @@ class _Task:
 
     @property
     def settings(self) -> dict[str, Any]:
-        return benchmark.plain(
-            {
-                "version": VERSION,
-                "plan": dataclasses.asdict(self.plan),
-                "sources": sources_digest(recording, route, traffic, vlp16),
-            }
-        )
+        return settings_of_plan(self.plan)
+
+
+def settings_of_plan(plan: DrivePlan) -> dict[str, Any]:
+    """Return everything that decides what a recorded drive holds, apart from its world."""
+    return benchmark.plain(
+        {
+            "version": VERSION,
+            "plan": dataclasses.asdict(plan),
+            "sources": sources_digest(recording, route, traffic, vlp16),
+        }
+    )
 
 
 def _is_recorded(task: _Task) -> bool:
@@ -299,15 +304,23 @@ def _world_of(task: _Task) -> World:
 
 
 def _record(task: _Task, advance: Callable[[int], None] | None) -> None:
-    """Drive, record a bag, and keep of it what the localizer takes."""
-    plan, world = task.plan, _world_of(task)
+    record_drive(task.folder, task.plan, _world_of(task), task.settings)
+    if advance is not None:
+        advance(1)
+
+
+def record_drive(folder: Path, plan: DrivePlan, world: World, settings: dict[str, Any]) -> None:
+    """Drive through a world, record a bag, and keep of it in `folder` what the localizer takes.
+
+    `settings`: how it was made, as `settings_of_plan` gives them. Raises RouteError where there is no room to drive.
+    """
     way = plan_route(
         world, plan.length_m, np.random.default_rng([plan.seed, 1]),
         clearance_m=plan.clearance_m, border_m=plan.border_m, speed_m_s=plan.speed_m_s,
     )  # fmt: skip
     mounting = MountingConfig(z_m=plan.height_m)
     config = DriveConfig(scan_every=plan.scan_every, mounting=mounting)
-    with whole(task.folder) as partial, tempfile.TemporaryDirectory(dir=partial.parent) as work:
+    with whole(folder) as partial, tempfile.TemporaryDirectory(dir=partial.parent) as work:
         drive(world, way, Path(work) / "bag", config, seed=plan.seed, start_ns=_START_NS)
         gravity = GravityFilter(_IMU_TIME_CONSTANT_S)
         scans: list[RawScan] = []
@@ -332,9 +345,7 @@ def _record(task: _Task, advance: Callable[[int], None] | None) -> None:
         odometry = np.array([sample[1:] for sample in samples])
         odometry[:, 2] = np.unwrap(odometry[:, 2])
         np.savez(partial / ODOMETRY, stamps_ns=np.array([sample[0] for sample in samples]), odometry=odometry)
-        mark_made(partial, task.settings)
-    if advance is not None:
-        advance(1)
+        mark_made(partial, settings)
 
 
 def load_drives(folder: Path) -> list[RawDrive]:

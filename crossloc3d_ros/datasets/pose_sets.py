@@ -15,7 +15,7 @@ import dataclasses
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from crossloc3d_ros.aerial_map import store
-from crossloc3d_ros.aerial_map.builder import build_map
 from crossloc3d_ros.datasets import amsterdam
 from crossloc3d_ros.datasets import benchmarks as benchmark
 from crossloc3d_ros.datasets.amsterdam import AMSTERDAM, AmsterdamBenchmark
 from crossloc3d_ros.datasets.made import is_made, mark_made, whole
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, save_scans
+from crossloc3d_ros.datasets.set_maps import Progress, make_map
 from crossloc3d_ros.datasets.simulated import SIMULATED, BenchmarkTown, SimulatedBenchmark, raw_scans, sources_digest
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.files import write_atomically
@@ -37,13 +37,15 @@ from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.survey import fly, write_survey
 from crossloc3d_ros.simulation.town import make_town
 from crossloc3d_ros.simulation.world import Bounds, World
-from crossloc3d_ros.types import DescriptorEncoder, Float64Array
+from crossloc3d_ros.types import Float64Array
 from crossloc3d_ros.workers import EncoderLoader
 
 _log = logging.getLogger(__name__)
 
 VERSION = 1
 MANIFEST = "pose_set.json"
+SURVEY = "survey"
+"""The folder of a town's LAZ tiles beside its scans."""
 ALL = "drawn by lot"
 SEAM_M = 60.0
 """How far robots stay inside of their town's square: beyond it the map shows another town."""
@@ -51,8 +53,6 @@ _MOSAIC_ORIGIN = np.array([500_000.0, 5_800_000.0, 0.0])
 """South-western corner of every mosaic, EPSG:32631."""
 _TOWN_BEYOND_M, _BEYOND_FLOWN_M = 60.0, 20.0
 """How far a simulated town goes on beyond the bounds that are given; how much wider it is than what is flown."""
-
-Progress = Callable[[str, float, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -216,11 +216,11 @@ def make_pose_set(
             advance(0)
             benchmark.without_encoder(_make_part, missing, workers, folder, advance)
         towns = [*poses.examined.towns, *poses.off_map]
-        map_folder = _make_map(
-            folder, [part.folder / "survey" for part in parts if part.corner is not None], poses.examined, loader,
+        map_folder = make_map(
+            folder, [part.folder / SURVEY for part in parts if part.corner is not None], poses.examined.build, loader,
             workers, report,
         )  # fmt: skip
-        _write_manifest(
+        write_manifest(
             folder,
             {
                 "name": name,
@@ -316,17 +316,20 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
             world, flown = placed_town(town, epoch, examined.town_size_m, part.corner)
             world = dataclasses.replace(world, bounds=flown)
             seen = fly(world, examined.flight, np.random.default_rng([town.seed, 1]))
-            write_survey(world, seen, partial / "survey", tile_m=500.0)
+            write_survey(world, seen, partial / SURVEY, tile_m=500.0)
         world, _ = placed_town(town, 1 - epoch, examined.town_size_m, part.corner)
-        rng = np.random.default_rng([town.seed, 2, 1 - epoch])
         count = examined.queries if part.corner is not None else part.poses.off_map_scans
-        local = world.sample_poses(
-            count, rng, clearance_m=examined.clearance_m, border_m=0.0, tilt_deg=examined.tilt_deg
-        )
-        save_scans(partial, RawScans.of(to_grid(scan, world) for scan in raw_scans(world, local, examined, rng)))
+        save_scans(partial, scans_of_town(world, town, examined, count))
         mark_made(partial, part.settings)
     if advance is not None:
         advance(1)
+
+
+def scans_of_town(world: World, town: BenchmarkTown, examined: SimulatedBenchmark, count: int) -> RawScans:
+    """Return so many scans, with poses in the grid, of a town as it stands at the epoch that is not flown."""
+    rng = np.random.default_rng([town.seed, 2, 1 - town.seed % 2])
+    local = world.sample_poses(count, rng, clearance_m=examined.clearance_m, border_m=0.0, tilt_deg=examined.tilt_deg)
+    return RawScans.of(to_grid(scan, world) for scan in raw_scans(world, local, examined, rng))
 
 
 def to_grid(scan: RawScan, world: World, group: int = 0) -> RawScan:
@@ -357,8 +360,8 @@ def _make_amsterdam(
                 spread = [to_grid(scan, town, 1) for scan in amsterdam.raw_spread(town, examined)]
                 save_scans(partial, RawScans.of([*driven, *spread]))
                 mark_made(partial, settings)
-        map_folder = _make_map(folder, [surveys / amsterdam.MAP_SURVEY], examined, lambda: encoder, 1, report)
-        _write_manifest(
+        map_folder = make_map(folder, [surveys / amsterdam.MAP_SURVEY], examined.build, lambda: encoder, 1, report)
+        write_manifest(
             folder,
             {
                 "name": name,
@@ -373,27 +376,6 @@ def _make_amsterdam(
     return load_pose_set(folder, map_folder)
 
 
-def _make_map(
-    folder: Path,
-    inputs: Sequence[Path],
-    examined: SimulatedBenchmark | AmsterdamBenchmark,
-    loader: EncoderLoader,
-    workers: int,
-    report: Progress,
-) -> Path:
-    """Return the map's folder, built where there is none yet for the weights that `loader` loads."""
-    encoder: DescriptorEncoder = loader()
-    map_folder = folder / f"map-{encoder.fingerprint[:12]}"
-    if not (map_folder / store.MANIFEST).is_file():
-        build_map(
-            inputs,
-            map_folder,
-            loader if workers > 1 else encoder,
-            dataclasses.replace(examined.build, workers=workers),
-            progress=lambda p: report(p.stage, p.done, p.total, p.unit),
-        )
-    return map_folder
-
-
-def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    """Write what `load_pose_set` reads of a set beside its scans."""
     write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1) + "\n", EvaluationError)

@@ -246,6 +246,33 @@ def reliability(
     return tuple(bins)
 
 
+def clustered_calibration_error(
+    probability: Float64Array, right: BoolArray, clusters: Int64Array, bins: int = 10
+) -> Share:
+    """Return the expected calibration error of probabilities (Q,), with its interval when clusters (Q,) are resampled.
+
+    The mean over the queries of how far, in each of so many equally wide bins, the mean probability is from the share
+    that was right (Naeini et al., AAAI 2015). Chance alone makes it larger than zero, the more the fewer queries a bin
+    holds, and resampling adds to it: the interval is one of the errors that such samples show. NaN without queries.
+    """
+    if not len(right):
+        return Share(math.nan, math.nan, math.nan)
+    number = np.minimum((np.asarray(probability) * bins).astype(np.int64), bins - 1)
+    cluster = np.unique(clusters, return_inverse=True)[1].reshape(-1)
+    count = int(cluster.max()) + 1
+    excess = np.bincount(cluster * bins + number, probability - right, minlength=count * bins).reshape(count, bins)
+    sizes = np.bincount(cluster)
+    value = float(np.abs(excess.sum(axis=0)).sum() / len(right))
+    drawn = _bootstrap_draws(count)
+    low, high = np.percentile(np.abs(drawn @ excess).sum(axis=1) / (drawn @ sizes), [2.5, 97.5])
+    return Share(value, min(float(low), value), max(float(high), value))
+
+
+def rule_of_three(trials: int) -> float:
+    """Return the 95 % upper bound of a share of which so many independent trials have shown none; 1 without trials."""
+    return min(1.0, 3.0 / trials) if trials else 1.0
+
+
 def squared_mahalanobis(offsets_m: Float64Array, covariance: Float64Array) -> Float64Array:
     """Return (n,) squared Mahalanobis lengths; infinite where a covariance is singular or not finite."""
     lengths = np.full(len(offsets_m), np.inf)

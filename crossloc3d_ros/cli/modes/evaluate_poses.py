@@ -17,9 +17,10 @@ from crossloc3d_ros.datasets.pose_drives import journeys_of, open_drives
 from crossloc3d_ros.datasets.pose_sets import open_pose_set
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError
-from crossloc3d_ros.evaluation.poses.predictions import about_of, load_predictions, predict, save_predictions
+from crossloc3d_ros.evaluation.poses.predictions import about_of, predict
 from crossloc3d_ros.evaluation.poses.report import CSV, JSON, MARKDOWN, PAGE, write_report
 from crossloc3d_ros.evaluation.poses.scores import score_poses
+from crossloc3d_ros.evaluation.poses.store import load_predictions, save_predictions
 from crossloc3d_ros.evaluation.poses.terminal import pose_tables
 from crossloc3d_ros.workers import EncoderLoader
 
@@ -30,7 +31,7 @@ def evaluate_poses(arguments: argparse.Namespace) -> None:
     """Make the predictions, score them, write and print the results."""
     target = console()
     set_up_logging(arguments.verbose, target)
-    _check(arguments)
+    check_pose_options(arguments)
     config = from_dict(LocalizerConfig, parse_assignments(arguments.set))
     output: Path = arguments.output or Path("out/evaluate") / f"pose_{arguments.benchmark}"
     if not arguments.only_score:
@@ -56,15 +57,22 @@ def label_of(arguments: argparse.Namespace) -> str:
     return "shipped weights" if arguments.weights is None else str(arguments.weights.stem)
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def check_pose_options(arguments: argparse.Namespace) -> None:
+    """Refuse options of --protocol place, and numbers that are none; ConfigError says which."""
     if arguments.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {arguments.workers}")
     if arguments.every < 1:
         raise ConfigError(f"--every must be at least 1, got {arguments.every}")
     if arguments.dataset is not None or arguments.method != "weights" or arguments.setting or arguments.query_headings:
-        raise ConfigError("--protocol pose knows neither --dataset, --method, --setting nor --query-headings")
+        raise ConfigError(
+            f"--protocol {arguments.protocol} knows neither --dataset, --method, --setting nor --query-headings"
+        )
     if arguments.verify:
-        raise ConfigError("--verify orders the places of --protocol place; the localizer of --protocol pose aligns")
+        raise ConfigError(
+            f"--verify orders the places of --protocol place; the localizer of --protocol {arguments.protocol} aligns"
+        )
+    if arguments.protocol == "pose" and (arguments.aerial or arguments.learned):
+        raise ConfigError("--aerial and --learned name surveys for --protocol belief: add it, or leave them out")
 
 
 def _predict(arguments: argparse.Namespace, config: LocalizerConfig, path: Path, display: ProgressDisplay) -> None:

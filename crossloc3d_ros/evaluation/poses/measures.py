@@ -9,7 +9,8 @@ from typing import Literal
 
 from crossloc3d_ros.evaluation.poses.predictions import PoseAbout
 
-Unit = Literal["%", "m", "degrees", "fixes", "ms"]
+Unit = Literal["%", "m", "degrees", "fixes", "scans", "ms"]
+Verdict = Literal["goal", "floor", "few", "below", ""]
 
 
 @dataclass(frozen=True)
@@ -33,22 +34,35 @@ class Measure:
     floor_high: float | None = None
     goal_high: float | None = None
     higher_is_better: bool = True
+    floor_count: int = 0
+    """So many must have been counted for the floor, ..."""
+    goal_count: int = 0
+    """... so many for the goal."""
 
     @property
-    def verdict(self) -> Literal["goal", "floor", "below", ""]:
-        """Say which of goal and floor the value reaches; empty where there is neither."""
+    def verdict(self) -> Verdict:
+        """Say which of goal and floor the value reaches; `few` where more have to be counted for it.
+
+        Empty where there is neither.
+        """
         if self.goal is None or math.isnan(self.value):
             return ""
-        for name, low, high in (("goal", self.goal, self.goal_high), ("floor", self.floor, self.floor_high)):
+        few = False
+        ends: tuple[tuple[Verdict, float | None, float | None, int], ...] = (
+            ("goal", self.goal, self.goal_high, self.goal_count),
+            ("floor", self.floor, self.floor_high, self.floor_count),
+        )
+        for name, low, high, least in ends:
             if low is None:
                 continue
             if high is not None:
                 reached = low <= self.value <= high
             else:
                 reached = self.value >= low if self.higher_is_better else self.value <= low
-            if reached:
-                return "goal" if name == "goal" else "floor"
-        return "below"
+            if reached and self.count >= least:
+                return name
+            few |= reached
+        return "few" if few else "below"
 
 
 @dataclass(frozen=True)
@@ -93,7 +107,7 @@ def goals_of(about: PoseAbout) -> Goals:
 
 def verdicts(measures: Sequence[Measure]) -> dict[str, int]:
     """Count how many measures reach their goal, their floor alone, and neither."""
-    counts = {"goal": 0, "floor": 0, "below": 0}
+    counts = {"goal": 0, "floor": 0, "few": 0, "below": 0}
     for measure in measures:
         if measure.verdict:
             counts[measure.verdict] += 1

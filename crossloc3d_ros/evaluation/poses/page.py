@@ -62,8 +62,8 @@ def write_pose_page(
         words=words,
         footer=footer,
         scores=scores,
-        figures={measure.key: _figure(measure) for measure in scores.measures},
-        families=[_figure(measure) for measure in scores.families],
+        figures={measure.key: figure_of(measure) for measure in scores.measures},
+        families=[figure_of(measure) for measure in scores.families],
         verdicts=verdicts(scores.measures),
         error_chart=_error_chart(scores),
         belief_chart=_belief_chart(scores),
@@ -72,7 +72,8 @@ def write_pose_page(
     write_atomically(path, render_page("poses.html.j2", page))
 
 
-def _figure(measure: Measure) -> Figure:
+def figure_of(measure: Measure) -> Figure:
+    """Return a measure as a page shows it."""
     return Figure(
         measure=measure,
         value=shown(measure),

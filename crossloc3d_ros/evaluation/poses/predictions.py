@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import math
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +15,10 @@ import numpy as np
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import LocalizerConfig, to_dict
 from crossloc3d_ros.datasets.pose_drives import Journey, RawDrive, load_drives, steps_of
-from crossloc3d_ros.datasets.pose_sets import PoseSet, Progress, load_pose_set
+from crossloc3d_ros.datasets.pose_sets import PoseSet, load_pose_set
 from crossloc3d_ros.datasets.raw_scans import RawScan
+from crossloc3d_ros.datasets.set_maps import Progress
 from crossloc3d_ros.errors import EvaluationError
-from crossloc3d_ros.files import atomic_path
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import OdometryKind, ScanLocalizer, Session
@@ -35,7 +33,6 @@ from crossloc3d_ros.types import (
 )
 from crossloc3d_ros.workers import EncoderLoader, open_workers
 
-FORMAT = 1
 Odometry = Literal["wheels", "scan", "none"]
 _SESSION_ODOMETRY: dict[Odometry, OdometryKind] = {"wheels": "topic", "scan": "scan", "none": "none"}
 """What measures how the robot moves: its wheels, its scans, nothing."""
@@ -173,40 +170,43 @@ class _Task:
 
 
 def _do(task: _Task, encoder: DescriptorEncoder, advance: Callable[[int], None] | None) -> PosePredictions:
-    frame = _map_of(task.map_folder, encoder.fingerprint).frame
-    localizer = _localizer_of(task.map_folder, encoder, task.config)
+    frame = map_of(task.map_folder, encoder.fingerprint).frame
+    localizer = localizer_of(task.map_folder, encoder, task.config)
     report = advance or (lambda _: None)
     if task.journey is None:
-        scans = _set_of(task.folder, task.map_folder).scans
+        scans = set_of(task.folder, task.map_folder).scans
         return predict_singles([scans[i] for i in task.singles], localizer, frame, report)
     number, journey = task.journey
-    return predict_journey(number, journey, _drives_of(task.folder), localizer, frame, task.odometry, report)
+    return predict_journey(number, journey, drives_of(task.folder), localizer, frame, task.odometry, report)
 
 
 @functools.lru_cache(maxsize=1)
-def _map_of(folder: Path, fingerprint: str) -> AerialMap:
+def map_of(folder: Path, fingerprint: str) -> AerialMap:
+    """Return a map, read once while one after the other uses it."""
     return AerialMap.load(folder, fingerprint)
 
 
 @functools.lru_cache(maxsize=1)
-def _set_of(folder: Path, map_folder: Path) -> PoseSet:
+def set_of(folder: Path, map_folder: Path) -> PoseSet:
+    """Return a pose set, read once while one after the other uses it."""
     return load_pose_set(folder, map_folder)
 
 
 @functools.lru_cache(maxsize=1)
-def _drives_of(folder: Path) -> tuple[RawDrive, ...]:
+def drives_of(folder: Path) -> tuple[RawDrive, ...]:
+    """Return the drives of a set's folder, read once while one after the other uses them."""
     return tuple(load_drives(folder))
 
 
 _localizers: dict[tuple[Path, str, LocalizerConfig], ScanLocalizer] = {}
 
 
-def _localizer_of(folder: Path, encoder: DescriptorEncoder, config: LocalizerConfig) -> ScanLocalizer:
+def localizer_of(folder: Path, encoder: DescriptorEncoder, config: LocalizerConfig) -> ScanLocalizer:
     """Return this process's localizer: a worker does many tasks with one."""
     key = (folder, encoder.fingerprint, config)
     if key not in _localizers:
         _localizers.clear()
-        localizer = Localizer(_map_of(folder, encoder.fingerprint), encoder, config)
+        localizer = Localizer(map_of(folder, encoder.fingerprint), encoder, config)
         localizer.warm_up()
         _localizers[key] = localizer
     return _localizers[key]
@@ -217,14 +217,16 @@ def predict_singles(
     localizer: ScanLocalizer,
     frame: MapFrame,
     advance: Callable[[int], None] = lambda _: None,
+    examine: Callable[[RawScan, Estimate], None] = lambda scan, estimate: None,
 ) -> PosePredictions:
-    """Localize each scan as if it were the first of all."""
+    """Localize each scan as if it were the first of all; `examine` is called with each and its estimate."""
     rows = []
     session = Session(localizer)
     for scan in scans:
         session.reset()
         estimate = _localize(session, scan)
         rows.append(_row(scan, estimate, frame, SINGLE, 0, 0.0))
+        examine(scan, estimate)
         advance(1)
     return join(rows)
 
@@ -237,8 +239,12 @@ def predict_journey(
     frame: MapFrame,
     odometry: Odometry = "wheels",
     advance: Callable[[int], None] = lambda _: None,
+    alone_every: int = _ALONE_EVERY,
 ) -> PosePredictions:
-    """Localize each scan of a journey, with the odometry that has arrived until then."""
+    """Localize each scan of a journey, with the odometry that has arrived until then.
+
+    Each `alone_every`-th scan of the first leg again, from nothing; none of them where it is 0.
+    """
     localizer.reset()
     session = Session(localizer, _SESSION_ODOMETRY[odometry])
     rows = []
@@ -251,7 +257,8 @@ def predict_journey(
         advance(1)
     # Some of them again, alone: what a scan shows by itself, against what the drive until there adds.
     session = Session(localizer)
-    for step in [step for step in steps_of(journey, drives) if step.leg == 0][::_ALONE_EVERY]:
+    again = [step for step in steps_of(journey, drives) if step.leg == 0] if alone_every else []
+    for step in again[:: max(alone_every, 1)]:
         session.reset()
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
         rows.append(_row(scan, _localize(session, scan), frame, _ALONE - number, 0, step.travelled_m))
@@ -334,15 +341,16 @@ def join(parts: Sequence[PosePredictions]) -> PosePredictions:
     """Return the rows of all parts."""
     if not parts:
         raise EvaluationError("nothing was predicted: the set holds neither scans nor drives")
-    return PosePredictions(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in _columns()})
+    return PosePredictions(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in column_names()})
 
 
 def select(predictions: PosePredictions, rows: BoolArray | Int64Array) -> PosePredictions:
     """Return some of the rows."""
-    return PosePredictions(**{name: getattr(predictions, name)[rows] for name in _columns()})
+    return PosePredictions(**{name: getattr(predictions, name)[rows] for name in column_names()})
 
 
-def _columns() -> Iterator[str]:
+def column_names() -> Iterator[str]:
+    """Return the names of the columns."""
     return (item.name for item in dataclasses.fields(PosePredictions))
 
 
@@ -363,29 +371,3 @@ def about_of(
         pose_set.families, pose_set.on_map, pose_set.groups, (east - west) * (north - south) / 1e6,
         len(aerial_map.submaps), to_dict(config), odometry, every,
     )  # fmt: skip
-
-
-def save_predictions(path: Path, predictions: PosePredictions, about: PoseAbout) -> None:
-    """Write predictions to one file, whole or not at all."""
-    text = json.dumps({"format": FORMAT, **dataclasses.asdict(about)})
-    with atomic_path(path, EvaluationError, parents=True) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, about=np.array(text), **{name: getattr(predictions, name) for name in _columns()})
-
-
-def load_predictions(path: Path) -> tuple[PosePredictions, PoseAbout]:
-    """Read predictions; EvaluationError where there are none, or they are damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content: dict[str, Any] = json.loads(str(file["about"]))
-            if content.pop("format") != FORMAT:
-                raise EvaluationError(f"{path} is of another format: predict again, without --only-score")
-            tuples = {name: tuple(value) for name, value in content.items() if isinstance(value, list)}
-            predictions = PosePredictions(**{name: file[name] for name in _columns()})
-        lengths = {len(getattr(predictions, name)) for name in _columns()}
-        if len(lengths) != 1:
-            raise EvaluationError(f"{path} is damaged: columns differ in length; predict again, without --only-score")
-        return predictions, PoseAbout(**{**content, **tuples})
-    except FileNotFoundError as error:
-        raise EvaluationError(f"{path} does not exist: run the command without --only-score first") from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise EvaluationError(f"{path} is damaged ({error}); predict again, without --only-score") from error

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from crossloc3d_ros.evaluation.poses.measures import Measure
@@ -27,7 +28,7 @@ def shown(measure: Measure, value: float | None = None) -> str:
         return "∞"
     if measure.unit == "%":
         return f"{_digits(100 * number)} %"
-    if measure.unit == "fixes":
+    if measure.unit in ("fixes", "scans"):
         return f"{number:,.0f}"
     unit = "°" if measure.unit == "degrees" else f" {measure.unit}"
     return f"{number:.0f}{unit}" if measure.unit == "ms" else f"{_digits(number)}{unit}"
@@ -41,7 +42,7 @@ def _digits(number: float) -> str:
 
 def interval_of(measure: Measure) -> str:
     """Return a measure's interval for people; empty where it has none."""
-    if math.isnan(measure.low) or measure.unit in ("fixes", "ms"):
+    if math.isnan(measure.low) or measure.unit in ("fixes", "scans", "ms"):
         return ""
     ends = []
     for end in (measure.low, measure.high):
@@ -56,7 +57,7 @@ def wanted(measure: Measure, low: float | None, high: float | None) -> str:
     """Return a floor or goal of a measure for people; empty where there is none."""
     if low is None:
         return ""
-    unit = {"degrees": "°", "fixes": ""}.get(measure.unit, f" {measure.unit}")
+    unit = {"degrees": "°", "fixes": "", "scans": ""}.get(measure.unit, f" {measure.unit}")
     factor = 100.0 if measure.unit == "%" else 1.0
     ends = [f"{factor * end:g}" for end in (low, high) if end is not None]
     return f"{'–'.join(ends)}{unit}"
@@ -64,11 +65,15 @@ def wanted(measure: Measure, low: float | None, high: float | None) -> str:
 
 def as_markdown(scores: PoseScores) -> str:
     """Return the table as Markdown."""
-    about = scores.about
-    lines = [f"| {about.pose_set} | | 95 % interval | floor | goal | of |", "|---|---|---|---|---|---|"]
-    for each in scores.measures:
+    return measures_as_markdown(scores.about.pose_set, scores.measures)
+
+
+def measures_as_markdown(title: str, measures: Sequence[Measure]) -> str:
+    """Return measures with floors and goals as a Markdown table: bold what reaches its goal, italic what is below."""
+    lines = [f"| {title} | | 95 % interval | floor | goal | of |", "|---|---|---|---|---|---|"]
+    for each in measures:
         floor, goal = wanted(each, each.floor, each.floor_high), wanted(each, each.goal, each.goal_high)
-        mark = {"goal": "**", "floor": "", "below": "_", "": ""}[each.verdict]
+        mark = {"goal": "**", "floor": "", "few": "", "below": "_", "": ""}[each.verdict]
         lines.append(
             f"| {each.text} | {mark}{shown(each)}{mark} | {interval_of(each)} | {floor} | {goal} | "
             f"{each.count:,} {each.counted} |"
@@ -78,13 +83,19 @@ def as_markdown(scores: PoseScores) -> str:
 
 def as_csv(scores: PoseScores) -> str:
     """Return every figure as CSV text."""
+    about = scores.about
+    kinds = (("table", scores.measures), ("family", scores.families))
+    return measures_as_csv([(about.pose_set, about.weights, kind, measures) for kind, measures in kinds])
+
+
+def measures_as_csv(parts: Sequence[tuple[str, str, str, Sequence[Measure]]]) -> str:
+    """Return measures as CSV text; each part is a set, its weights, a kind and the measures."""
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
-    for kind, measures in (("table", scores.measures), ("family", scores.families)):
+    for name, weights, kind, measures in parts:
         for each in measures:
-            writer.writerow({"set": scores.about.pose_set, "weights": scores.about.weights, "kind": kind,
-                             **_measure(each)})  # fmt: skip
+            writer.writerow({"set": name, "weights": weights, "kind": kind, **measure_as_plain(each)})
     return text.getvalue()
 
 
@@ -92,8 +103,8 @@ def as_json(scores: PoseScores) -> str:
     """Return everything as JSON text; NaN becomes null, infinity the word `infinite`."""
     content = {
         "about": dataclasses.asdict(scores.about),
-        "table": [_measure(each) for each in scores.measures],
-        "families": [_measure(each) for each in scores.families],
+        "table": [measure_as_plain(each) for each in scores.measures],
+        "families": [measure_as_plain(each) for each in scores.families],
         "stages": {
             "single scans": [dataclasses.asdict(stage) for stage in scores.stages],
             "drives": [dataclasses.asdict(stage) for stage in scores.drive_stages],
@@ -104,10 +115,11 @@ def as_json(scores: PoseScores) -> str:
         ],
         "inside_k_sigma": {"k": SIGMAS.tolist(), **{name: c.tolist() for name, c in scores.inside.items()}},
     }
-    return json.dumps(_finite(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(finite(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _measure(each: Measure) -> dict[str, Any]:
+def measure_as_plain(each: Measure) -> dict[str, Any]:
+    """Return a measure as plain values."""
     return {
         "measure": each.key,
         "text": each.text,
@@ -125,11 +137,12 @@ def _measure(each: Measure) -> dict[str, Any]:
     }
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Return plain values as JSON holds them: rounded, NaN as null, infinity as a word."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float):
         if math.isinf(value):
             return "infinite"

@@ -112,10 +112,10 @@ def score_poses(predictions: PosePredictions, about: PoseAbout) -> PoseScores:
     goals = goals_of(about)
     measures = (
         *_single_measures(singles, goals),
-        *_way_measures(track, goals),
+        *way_measures(track, goals),
         *_after_measures(track, after, goals),
         _wrong_measure(evaluated, goals),
-        _sigma_measure(after, goals),
+        sigma_measure(after, goals),
         *_away_measures(away, select(away, away.journey >= 0), goals),
         *_time_measures(predictions),
     )
@@ -133,23 +133,27 @@ def score_poses(predictions: PosePredictions, about: PoseAbout) -> PoseScores:
     )
 
 
-def _clusters(predictions: PosePredictions) -> Int64Array:
+def clusters(predictions: PosePredictions) -> Int64Array:
+    """Return (N,) which independent piece of evidence each row belongs to; see `statistics`."""
     return clusters_of(predictions.area, predictions.truth[:, :2])
 
 
-def _places(predictions: PosePredictions) -> int:
+def places(predictions: PosePredictions) -> int:
+    """Count the places at least 25 m apart."""
     return independent_places_in_areas(predictions.area, predictions.truth[:, :2])
 
 
-def _share(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: Goals) -> Measure:
-    share = clustered_share(hit, _clusters(of), _places(of))
+def share_measure(key: str, text: str, hit: BoolArray, of: PosePredictions, counted: str, goals: Goals) -> Measure:
+    """Return the share of hits (N,) among rows, with its interval."""
+    share = clustered_share(hit, clusters(of), places(of))
     return goals.measure(key, text, "%", share.value, share.low, share.high, len(hit), counted)
 
 
-def _quantile(
+def quantile_measure(
     key: str, text: str, unit: Unit, values: Float64Array, of: PosePredictions, q: float, counted: str, goals: Goals
 ) -> Measure:
-    value, low, high = clustered_quantile(values, _clusters(of), q)
+    """Return a quantile of values (N,) of rows, with its interval."""
+    value, low, high = clustered_quantile(values, clusters(of), q)
     return goals.measure(key, text, unit, value, low, high, len(values), counted)
 
 
@@ -159,16 +163,17 @@ def _single_measures(singles: PosePredictions, goals: Goals) -> tuple[Measure, .
     pose = f"pose within {WITHIN_M:g} m and {WITHIN_DEG:g}°"
     found = np.asarray((nearest <= AMONG_M).any(axis=1), np.bool_)
     return (
-        _share("among", f"one scan, no prior: {pose}, of the scans whose true place is among the 25 candidates",
+        share_measure("among", f"one scan, no prior: {pose}, of the scans whose true place is among the 25 candidates",
                is_right(among, best_aligned(among)), among, "scans", goals),
-        _share("end_to_end", f"one scan, no prior, end to end: {pose}",
+        share_measure("end_to_end", f"one scan, no prior, end to end: {pose}",
                is_right(singles, best_aligned(singles)), singles, "scans", goals),
-        _share("place_found", f"… the true place is among the 25 candidates (a centre within {AMONG_M:g} m)",
+        share_measure("place_found", f"… the true place is among the 25 candidates (a centre within {AMONG_M:g} m)",
                found, singles, "scans", goals),
     )  # fmt: skip
 
 
-def _way_measures(track: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
+def way_measures(track: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
+    """Return how far robots travel until they are localized, from nothing and kidnapped."""
     legs = legs_of(track)
     right = track.has_fix & (error_m(track) <= WRONG_M)
     measures = []
@@ -181,8 +186,8 @@ def _way_measures(track: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
                          for rows in chosen])  # fmt: skip
         first = select(track, np.array([rows[0] for rows in chosen], np.int64))
         measures += [
-            _quantile(f"{key}_median", f"{text}, median", "m", ways, first, 0.5, "drives", goals),
-            _quantile(f"{key}_95", f"{text}, 95 %", "m", ways, first, 0.95, "drives", goals),
+            quantile_measure(f"{key}_median", f"{text}, median", "m", ways, first, 0.5, "drives", goals),
+            quantile_measure(f"{key}_95", f"{text}, 95 %", "m", ways, first, 0.95, "drives", goals),
         ]
     return tuple(measures)
 
@@ -191,23 +196,26 @@ def _after_measures(track: PosePredictions, after: PosePredictions, goals: Goals
     metres, degrees = error_m(after), error_deg(after)
     later = select(track, localized_before(track))
     return (
-        _quantile("after_median", "afterwards: error, median", "m", metres, after, 0.5, "fixes", goals),
-        _quantile("after_95", "afterwards: error, 95 %", "m", metres, after, 0.95, "fixes", goals),
-        _quantile("heading_median", "heading error, median", "degrees", degrees, after, 0.5, "fixes", goals),
-        _quantile("heading_95", "heading error, 95 %", "degrees", degrees, after, 0.95, "fixes", goals),
-        _share("available", "scans with a fix, once localized", later.has_fix, later, "scans", goals),
+        quantile_measure("after_median", "afterwards: error, median", "m", metres, after, 0.5, "fixes", goals),
+        quantile_measure("after_95", "afterwards: error, 95 %", "m", metres, after, 0.95, "fixes", goals),
+        quantile_measure("heading_median", "heading error, median", "degrees", degrees, after, 0.5, "fixes", goals),
+        quantile_measure("heading_95", "heading error, 95 %", "degrees", degrees, after, 0.95, "fixes", goals),
+        share_measure("available", "scans with a fix, once localized", later.has_fix, later, "scans", goals),
     )
 
 
 def _wrong_measure(evaluated: PosePredictions, goals: Goals) -> Measure:
     fixes = select(evaluated, evaluated.has_fix)
-    return _share("wrong", f"fixes that are wrong by more than {WRONG_M:g} m", error_m(fixes) > WRONG_M, fixes,
+    return share_measure("wrong", f"fixes that are wrong by more than {WRONG_M:g} m", error_m(fixes) > WRONG_M, fixes,
                   "fixes", goals)  # fmt: skip
 
 
-def _sigma_measure(after: PosePredictions, goals: Goals) -> Measure:
+def sigma_measure(after: PosePredictions, goals: Goals) -> Measure:
+    """Return the share of the errors of fixes inside of two sigma of their covariance."""
     inside = mahalanobis(after) <= -2.0 * math.log(1.0 - _TWO_SIGMA)
-    return _share("inside_2_sigma", "errors inside 2 sigma (the ellipse of 95.4 %)", inside, after, "fixes", goals)
+    return share_measure(
+        "inside_2_sigma", "errors inside 2 sigma (the ellipse of 95.4 %)", inside, after, "fixes", goals
+    )
 
 
 def _away_measures(away: PosePredictions, driven: PosePredictions, goals: Goals) -> tuple[Measure, ...]:
@@ -228,7 +236,7 @@ def _time_measures(predictions: PosePredictions) -> tuple[Measure, ...]:
 
 def _stage(name: str, of: PosePredictions, pose: Float64Array) -> Stage:
     metres = distance_m(of, pose)
-    share = clustered_share(is_right(of, pose), _clusters(of), _places(of))
+    share = clustered_share(is_right(of, pose), clusters(of), places(of))
     middle = float(np.median(metres)) if len(metres) else math.nan
     near, far = (float(np.mean(metres <= radius)) if len(metres) else math.nan for radius in (10.0, 50.0))
     return Stage(name, len(of), share.value, share.low, share.high, near, far, middle)
@@ -270,7 +278,9 @@ def _family_measures(singles: PosePredictions, about: PoseAbout) -> tuple[Measur
     for name, chosen in divisions:
         of = select(singles, chosen)
         if len(of):
-            measures.append(_share(f"end_to_end/{name}", name, is_right(of, best_aligned(of)), of, "scans", Goals({})))
+            measures.append(
+                share_measure(f"end_to_end/{name}", name, is_right(of, best_aligned(of)), of, "scans", Goals({}))
+            )
     return tuple(measures)
 
 

@@ -19,8 +19,6 @@ from crossloc3d_ros.evaluation.poses.predictions import (
     PoseAbout,
     PosePredictions,
     join,
-    load_predictions,
-    save_predictions,
 )
 from crossloc3d_ros.evaluation.poses.scores import (
     SIGMAS,
@@ -28,6 +26,7 @@ from crossloc3d_ros.evaluation.poses.scores import (
     expected_inside,
     score_poses,
 )
+from crossloc3d_ros.evaluation.poses.store import load_predictions, save_predictions
 from crossloc3d_ros.types import WHOLE_MAP
 
 TOWNS = 10
