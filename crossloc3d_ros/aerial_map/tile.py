@@ -15,8 +15,8 @@ from scipy import ndimage
 
 from crossloc3d_ros.aerial_map.spool import TileKey, read_points, tile_bounds
 from crossloc3d_ros.aerial_map.store import SUBMAP_DTYPE, GroundMethod
-from crossloc3d_ros.clouds.ground import classify_ground
 from crossloc3d_ros.clouds.raster import Bounds, Raster, lowest_raster, surface_raster, terrain_raster
+from crossloc3d_ros.clouds.survey_ground import classify_ground
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.files import atomic_path
