@@ -31,7 +31,7 @@ from crossloc3d_ros.workers import Workers
 
 _log = logging.getLogger(__name__)
 
-_WORK_VERSION = 3
+_WORK_VERSION = 4
 """Raised when the files of the work folder change: an older half-done build is started anew then."""
 
 
