@@ -76,12 +76,12 @@ def tile_coverage(
     """
     if not np.isfinite(distance_m).any():
         return TileCoverage()
-    flown = distance_m <= FLOWN_REACH_M
-    inside = _closed(distance_m, cell_m)[within] | flown[within]
-    gaps = inside & ~flown[within]
+    inside = _closed(distance_m, cell_m)[within]
+    flown = inside & (distance_m[within] <= FLOWN_REACH_M)
+    gaps = inside & ~flown
     wooded = _wooded(highest_m, cell_m)[within] & inside
     return TileCoverage(
-        densities=_densities(support[within], flown[within], cell_m),
+        densities=_densities(support[within], flown, cell_m),
         inside=int(inside.sum()),
         empty=int((inside & (support[within] == 0)).sum()),
         gaps=int(gaps.sum()),
@@ -159,15 +159,15 @@ def survey_coverage(tiles: Iterable[TileCoverage]) -> Coverage:
 def coverage_warnings(coverage: Coverage) -> tuple[str, ...]:
     """Return what a user must know before a robot relies on a map of this survey, a sentence each."""
     warnings = []
-    if coverage.points_per_m2 < _TOO_SPARSE_PER_M2:
-        warnings.append(
-            f"the survey has {coverage.points_per_m2:.2g} points/m2, too few to tell places apart: "
-            "most of what a robot sees is not in it; use a survey of at least 0.5 points/m2"
-        )
     if coverage.gap_share > _MOSTLY_EMPTY:
         warnings.append(
             f"{coverage.gap_share:.0%} of the area have no echo, as water or gaps between strips: "
             "a robot there has nothing to be localized by"
+        )
+    elif coverage.points_per_m2 < _TOO_SPARSE_PER_M2:
+        warnings.append(
+            f"the survey has {coverage.points_per_m2:.2g} points/m2, too few to tell places apart: "
+            "most of what a robot sees is not in it; use a survey of at least 0.5 points/m2"
         )
     if coverage.wood_share > _MOSTLY_WOOD:
         warnings.append(
