@@ -140,7 +140,7 @@ def test_walls_of_rock_and_steep_slopes_stay_ground(name: str, kept: float, dens
 
 
 def test_openings_alone_climb_into_wide_roofs() -> None:
-    """Finding walls is needed: without it much of the hall is ground, and so where the hall exceeds the largest roof."""
+    """Finding walls is needed: without it much of the hall is ground, as where it exceeds the largest roof."""
     scene = a_scene("hall of 20,000 m2", 4.0)
     roof = box(scene.points[:, 0], scene.points[:, 1], 628_200, 5_803_200, 198, 98)
     assert np.mean(classify_ground(scene.points, largest_roof_m2=0.0)[roof]) > 0.3
