@@ -19,6 +19,7 @@ from crossloc3d_ros.aerial_map.assemble import (
     survey_bounds,
     write_submaps,
 )
+from crossloc3d_ros.aerial_map.coverage import survey_coverage
 from crossloc3d_ros.aerial_map.disk import bytes_needed, room_on_disk
 from crossloc3d_ros.aerial_map.progress import ProgressCallback
 from crossloc3d_ros.aerial_map.store import SourceRecord, read_submaps
@@ -86,7 +87,7 @@ def cut_aerial(
 
 def _write(folder: Path, survey: Survey, built: BuiltTiles, preprocessing: PreprocessingConfig) -> None:
     counts = build_counts(built)
-    check_submaps(counts, preprocessing)
+    check_submaps(counts, preprocessing, survey_coverage(report.coverage for report in built.reports))
     about = {
         "crs": survey.map_crs,
         "bounds": survey_bounds(built),

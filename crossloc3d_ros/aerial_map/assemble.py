@@ -12,6 +12,7 @@ import numpy as np
 
 from crossloc3d_ros import __version__
 from crossloc3d_ros.aerial_map import store
+from crossloc3d_ros.aerial_map.coverage import Coverage, survey_coverage
 from crossloc3d_ros.aerial_map.descriptor_map import write_descriptors
 from crossloc3d_ros.aerial_map.geotiff import write_geotiff
 from crossloc3d_ros.aerial_map.spool import TileKey, tile_bounds, tiles_touched
@@ -42,7 +43,8 @@ def write_map(
     `advance` counts the files. Raises AerialDataError where no tile has a submap.
     """
     counts = build_counts(built)
-    check_submaps(counts, encoder.preprocessing)
+    coverage = survey_coverage(report.coverage for report in built.reports)
+    check_submaps(counts, encoder.preprocessing, coverage)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     descriptors = (result.submap_values for result in results(built))
@@ -85,16 +87,24 @@ def _manifest(
         files=store.file_records(folder),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=f"crossloc3d_ros {__version__}",
+        coverage=survey_coverage(report.coverage for report in built.reports),
     )
 
 
-def check_submaps(counts: BuildCounts, preprocessing: PreprocessingConfig) -> None:
-    """Raise AerialDataError where the survey has no submap."""
+def check_submaps(counts: BuildCounts, preprocessing: PreprocessingConfig, coverage: Coverage) -> None:
+    """Raise AerialDataError where the survey has no submap, with what it has instead."""
     if counts.submaps == 0:
         raise AerialDataError(
             f"the area is empty: of its {counts.points_used:,} points nowhere at least "
-            f"{preprocessing.min_points} stand above the ground within one submap; no map was made"
+            f"{preprocessing.min_points} stand above the ground within one submap ({_what_is_there(coverage)}); "
+            "no map was made"
         )
+
+
+def _what_is_there(coverage: Coverage) -> str:
+    """Return how the survey covers the area, in half a sentence."""
+    gaps = f", and {coverage.gap_share:.0%} of the area have no echo, as water" if coverage.gap_share > 0.2 else ""
+    return f"{coverage.points_per_m2:.2g} points/m2{gaps}"
 
 
 def results(built: BuiltTiles) -> Iterator[TileResult]:
@@ -166,6 +176,8 @@ def _write_rasters(
     for name, values, description in layers:
         write_geotiff(folder / name, bounds, config.cell_m, crs, values, description)
         advance(1)
+    write_geotiff(folder / store.SUPPORT, bounds, config.cell_m, crs, rasters.support, "number of echoes", "counts")
+    advance(1)
 
 
 class _TileRasters:
@@ -184,6 +196,9 @@ class _TileRasters:
 
     def lowest(self, bounds: Bounds) -> Float32Array:
         return self._gather(bounds, "lowest")
+
+    def support(self, bounds: Bounds) -> Float32Array:
+        return np.nan_to_num(self._gather(bounds, "support"))
 
     def _gather(self, bounds: Bounds, layer: str) -> Float32Array:
         cell_m, tile_m = self._config.cell_m, self._config.tile_m

@@ -94,7 +94,7 @@ def build_map(
                 built = build_tiles(job, workers, report)
             watch = Stopwatch()
             geoid_m = 0.0 if survey.vertical.ellipsoidal else geoid_separation_m
-            advance = Counter("writing", 0, len(store.DATA_FILES), "files", report)
+            advance = Counter("writing", 0, len(store.DATA_FILES + store.OPTIONAL_FILES), "files", report)
             manifest = write_map(work / "result", survey, built, encoder, config, geoid_m, advance)
             publish(work / "result", output)
             writing_s = watch.lap()

@@ -22,7 +22,7 @@ def bytes_needed(survey: Survey, config: BuildConfig, numbers_a_submap: int) -> 
 
     `numbers_a_submap`: of the descriptor, or of the patch.
     """
-    rasters = 3 * 4 * survey.area_m2 / config.cell_m**2
+    rasters = 4 * 4 * survey.area_m2 / config.cell_m**2
     submaps = survey.area_m2 / config.spacing_m**2 * (4 * numbers_a_submap + store.SUBMAP_DTYPE.itemsize)
     return int(survey.points * POINT_DTYPE.itemsize + 2 * (rasters + submaps))
 

@@ -6,6 +6,7 @@ submaps.npy        one row a submap: easting, northing, ground height, number of
 terrain.tif        the ground as GeoTIFF, holes filled
 surface.tif        the highest point of each cell as GeoTIFF
 lowest.tif         the lowest point of each cell as GeoTIFF: whether pulses got through to the ground
+support.tif        the number of points of each cell as GeoTIFF; maps of before this file was written lack it
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.coverage import Coverage
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.geotiff import read_geotiff
 from crossloc3d_ros.clouds.raster import Bounds, Raster
@@ -34,6 +36,9 @@ FORMAT_VERSION = 2  # raised when the files change in a way that older readers c
 MANIFEST, DESCRIPTORS, SUBMAPS = "manifest.json", "descriptors.faiss", "submaps.npy"
 TERRAIN, SURFACE, LOWEST = "terrain.tif", "surface.tif", "lowest.tif"
 DATA_FILES = (DESCRIPTORS, SUBMAPS, TERRAIN, SURFACE, LOWEST)
+SUPPORT = "support.tif"
+OPTIONAL_FILES = (SUPPORT,)
+"""Files that a map may lack; where its manifest names them they must be there, and whole."""
 
 SUBMAP_DTYPE = np.dtype([("easting", "<f8"), ("northing", "<f8"), ("ground_height", "<f8"), ("points", "<i4")])
 
@@ -105,6 +110,8 @@ class Manifest:
     created: str
     """UTC, ISO 8601."""
     software: str
+    coverage: Coverage | None = None
+    """How densely and how completely the survey covers the map; null in maps that were not asked."""
     format: str = FORMAT
     format_version: int = FORMAT_VERSION
 
@@ -134,6 +141,8 @@ class AerialMap:
     terrain_path: Path = field(default_factory=Path)
     surface_path: Path = field(default_factory=Path)
     lowest_path: Path = field(default_factory=Path)
+    support_path: Path | None = None
+    """None where the map has no such file."""
 
     @property
     def bounds(self) -> Bounds:
@@ -158,6 +167,10 @@ class AerialMap:
         """Read the lowest echoes, or a part of them."""
         return read_geotiff(self.lowest_path, bounds)
 
+    def support(self, bounds: Bounds | None = None) -> Raster | None:
+        """Read how many echoes each cell has, or a part of it: 0 where there is none; None where the map lacks it."""
+        return None if self.support_path is None else read_geotiff(self.support_path, bounds)
+
     @classmethod
     def load(cls, path: str | Path, encoder_fingerprint: str | None = None) -> AerialMap:
         """Open a map folder, checking version, checksums and, where given, that this encoder made it.
@@ -181,7 +194,9 @@ class AerialMap:
                 "build it again"
             )
         frame = MapFrame(manifest.crs, np.array(manifest.origin), manifest.geoid_separation_m)
-        return cls(folder, manifest, frame, submaps, index, folder / TERRAIN, folder / SURFACE, folder / LOWEST)
+        support = folder / SUPPORT if any(record.name == SUPPORT for record in manifest.files) else None
+        rasters = (folder / TERRAIN, folder / SURFACE, folder / LOWEST, support)
+        return cls(folder, manifest, frame, submaps, index, *rasters)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -218,14 +233,15 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 def file_records(folder: Path) -> tuple[FileRecord, ...]:
     """Return sizes and checksums of the data files of a map folder."""
-    return tuple(FileRecord(name, (folder / name).stat().st_size, sha256(folder / name)) for name in DATA_FILES)
+    names = [*DATA_FILES, *(name for name in OPTIONAL_FILES if (folder / name).is_file())]
+    return tuple(FileRecord(name, (folder / name).stat().st_size, sha256(folder / name)) for name in names)
 
 
 def check_files(folder: Path, manifest: Manifest) -> None:
     """Raise MapError where a file of the map is missing, of another size or of another content than it was."""
     advice = "copy the map again or build it anew"
     records = {record.name: record for record in manifest.files}
-    for name in DATA_FILES:
+    for name in (*DATA_FILES, *(name for name in OPTIONAL_FILES if name in records)):
         record, file = records.get(name), folder / name
         if record is None or not file.is_file():
             raise MapError(f"the map {folder} lacks its file {name}; {advice}")

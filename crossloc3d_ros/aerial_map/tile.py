@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from crossloc3d_ros.aerial_map.coverage import FLOWN_REACH_M, TileCoverage, tile_coverage
 from crossloc3d_ros.aerial_map.spool import TileKey, read_points, tile_bounds
 from crossloc3d_ros.aerial_map.store import SUBMAP_DTYPE, GroundMethod
-from crossloc3d_ros.clouds.ground import classify_ground
-from crossloc3d_ros.clouds.raster import Bounds, Raster, lowest_raster, surface_raster, terrain_raster
+from crossloc3d_ros.clouds.raster import Bounds, Raster, count_raster, lowest_raster, surface_raster, terrain_raster
+from crossloc3d_ros.clouds.survey_ground import classify_ground
 from crossloc3d_ros.clouds.tiling import SubmapCutter, submap_centres
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig
 from crossloc3d_ros.files import atomic_path
@@ -31,8 +32,6 @@ _MARGIN_M = 60.0
 """At least this much is looked at around a tile, so that ground and rasters are the same on both sides of an edge."""
 _TERRAIN_REACH_M = 50.0
 """The terrain is continued this far where there are no points, such as canals, and no farther."""
-_FLOWN_REACH_M = 5.0
-"""A cell this near to a point counts as flown over."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +73,7 @@ class TileReport:
     data_bounds: Bounds | None
     """Bounds of the cells that hold points, None where there is none."""
     times: TileTimes = field(default_factory=TileTimes)
+    coverage: TileCoverage = field(default_factory=TileCoverage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +89,8 @@ class TileResult:
     """(H, W), row 0 in the north, the tile alone."""
     surface: Float32Array
     lowest: Float32Array
+    support: Float32Array
+    """Points of each cell."""
 
 
 def margin_m(half_extent_m: float, cell_m: float) -> float:
@@ -140,7 +142,7 @@ def _make_tile(
         submaps += [(*centre.tolist(), patch.source_count) for centre, patch in cut]
         encode_s += watch.lap()
         advance(len(batch))
-    terrain, surface, lowest = layers.of_tile(task)
+    terrain, surface, lowest, support = layers.of_tile(task)
     report = TileReport(
         key=task.key,
         submaps=len(submaps),
@@ -149,9 +151,10 @@ def _make_tile(
         ground=ground,
         data_bounds=_data_bounds(surface, tile_bounds(task.key, task.config.tile_m), task.config.cell_m),
         times=TileTimes(read_s, ground_s, raster_s, cut_s, encode_s),
+        coverage=layers.coverage(task),
     )
-    result = TileResult(report, np.array(submaps, SUBMAP_DTYPE), np.concatenate(values), terrain, surface, lowest)
-    write_result(task.result, result)
+    rasters = (terrain, surface, lowest, support)
+    write_result(task.result, TileResult(report, np.array(submaps, SUBMAP_DTYPE), np.concatenate(values), *rasters))
     return report
 
 
@@ -174,6 +177,7 @@ class _Layers:
     terrain: Raster
     surface: Raster
     lowest: Raster
+    support: Raster
     distance_m: Float32Array
     """Of each cell to the nearest one that holds a point."""
 
@@ -184,14 +188,23 @@ class _Layers:
             terrain_raster(points, is_ground, bounds, cell_m),
             surface,
             lowest_raster(points, bounds, cell_m),
+            count_raster(points, bounds, cell_m),
             distance_to_points(surface),
         )
 
-    def of_tile(self, task: TileTask) -> tuple[Float32Array, Float32Array, Float32Array]:
-        """Return terrain, surface and lowest echoes without the margin, the terrain as far as it is known."""
+    def of_tile(self, task: TileTask) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
+        """Return terrain, surface, lowest echoes and support without the margin, the terrain as far as it is known."""
         within = _inner_cells(self.surface, tile_bounds(task.key, task.config.tile_m))
         known = np.where(self.distance_m <= _TERRAIN_REACH_M, self.terrain.values, np.float32(np.nan))
-        return known[within], self.surface.values[within], self.lowest.values[within]
+        layers = (self.surface, self.lowest, self.support)
+        surface, lowest, support = (layer.values[within] for layer in layers)
+        return known[within], surface, lowest, support
+
+    def coverage(self, task: TileTask) -> TileCoverage:
+        """Measure how the tile is covered."""
+        within = _inner_cells(self.surface, tile_bounds(task.key, task.config.tile_m))
+        highest_m = self.surface.values - self.terrain.values
+        return tile_coverage(self.support.values, self.distance_m, highest_m, within, task.config.cell_m)
 
 
 def _read_points(task: TileTask) -> _TilePoints:
@@ -240,6 +253,7 @@ def write_result(path: Path, result: TileResult) -> None:
             terrain=result.terrain,
             surface=result.surface,
             lowest=result.lowest,
+            support=result.support,
         )
 
 
@@ -253,6 +267,7 @@ def read_result(path: Path) -> TileResult:
             terrain=file["terrain"],
             surface=file["surface"],
             lowest=file["lowest"],
+            support=file["support"],
         )
 
 
@@ -270,6 +285,8 @@ def _report(encoded: UInt8Array) -> TileReport:
     values["key"] = tuple(values["key"])
     values["data_bounds"] = tuple(values["data_bounds"]) if values["data_bounds"] else None
     values["times"] = TileTimes(**values["times"])
+    coverage = values["coverage"]
+    values["coverage"] = TileCoverage(**{**coverage, "densities": tuple(coverage["densities"])})
     return TileReport(**values)
 
 
@@ -285,7 +302,7 @@ def distance_to_points(surface: Raster) -> Float32Array:
 def coverage(distance_m: Float32Array, surface: Raster, centres: Float64Array, half_extent_m: float) -> Float64Array:
     """Return the share (M,) of each submap's square that was flown over."""
     side = max(1, round(2.0 * half_extent_m / surface.cell_m))
-    flown = (distance_m <= _FLOWN_REACH_M).astype(np.float32)
+    flown = (distance_m <= FLOWN_REACH_M).astype(np.float32)
     share = ndimage.uniform_filter(flown, size=side, mode="constant")
     columns = np.floor((centres[:, 0] - surface.west_m) / surface.cell_m).astype(int)
     rows = np.floor((surface.north_m - centres[:, 1]) / surface.cell_m).astype(int)

@@ -31,7 +31,7 @@ from crossloc3d_ros.workers import Workers
 
 _log = logging.getLogger(__name__)
 
-_WORK_VERSION = 3
+_WORK_VERSION = 4
 """Raised when the files of the work folder change: an older half-done build is started anew then."""
 
 
@@ -213,7 +213,8 @@ def _plan_tiles(job: TileJob, spooled: Sequence[SpoolReport]) -> _TilePlan:
     if not kept:
         raise AerialDataError(
             f"the area is empty: {points:,} of {sum(r.points_in_file for r in spooled):,} points are left without "
-            "noise and withheld points, and nowhere do enough of them lie together for a submap"
+            f"noise and withheld points, and nowhere do enough of them ({job.preprocessing.min_points}) lie together "
+            "for a submap, as on water, which gives no echo"
         )
     return _TilePlan(
         job=job,

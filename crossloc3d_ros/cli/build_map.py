@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from crossloc3d_ros.aerial_map.builder import BuildReport, build_map
+from crossloc3d_ros.aerial_map.coverage import SPARSE_PER_M2, Coverage, coverage_warnings
 from crossloc3d_ros.cli.common import (
     ProgressDisplay,
     add_options,
@@ -87,6 +88,7 @@ def summary(report: BuildReport) -> str:
         ("map", f"{report.output}{' (an earlier build was continued)' if report.resumed else ''}"),
         ("area", f"{(east - west) / 1e3:.2f} x {(north - south) / 1e3:.2f} km, {manifest.crs}"),
         ("points", f"{counts.points_used:,} used, {dropped:,} dropped (noise, withheld, stray)"),
+        *_covered(manifest.coverage),
         ("ground", ground),
         ("heights", _heights(report)),
         (
@@ -99,8 +101,26 @@ def summary(report: BuildReport) -> str:
             f"{report.submaps_encoded:,} submaps in {report.encoding_s:.1f} s, {report.submaps_per_s:,.1f} a second",
         ),
         ("writing", f"{report.writing_s:.1f} s"),
+        *(("warning", text) for text in (coverage_warnings(manifest.coverage) if manifest.coverage else ())),
     ]
     return "\n".join(f"{name:<9} {text}" for name, text in rows)
+
+
+def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:
+    """Return how densely and how completely the survey covers the area."""
+    if coverage is None:
+        return []
+    sparse = f"; sparse, as all below {SPARSE_PER_M2:g}" if coverage.points_per_m2 < SPARSE_PER_M2 else ""
+    gaps = f"{coverage.gap_share:.1%} in gaps or water"
+    if coverage.widest_gap_m > 0:
+        gaps += f", up to {coverage.widest_gap_m:.0f} m wide"
+    return [
+        (
+            "density",
+            f"{coverage.points_per_m2:.2g} points/m2, {coverage.points_per_m2_low:.2g} in the thinnest 5 %{sparse}",
+        ),
+        ("cells", f"{coverage.empty_share:.0%} without an echo ({gaps}); {coverage.wood_share:.0%} of the area wood"),
+    ]
 
 
 def _heights(report: BuildReport) -> str:

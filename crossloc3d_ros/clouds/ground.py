@@ -1,20 +1,15 @@
-"""Where the ground is: under a robot that sees it in a few sparse rings, and in an aerial survey without classes."""
+"""Where the ground is under a robot that sees it in a few sparse rings."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
-from scipy import ndimage
 
 from crossloc3d_ros.clouds.filters import check_points
-from crossloc3d_ros.clouds.raster import Raster, fill_holes, lowest_raster
 from crossloc3d_ros.errors import CloudError
-from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array
-
-# --- the ground around a robot ------------------------------------------------------------------------------------
+from crossloc3d_ros.types import Float32Array, Float64Array
 
 _CELL_M = 2.0  # holds a few points of most rings near the robot, and is narrower than a street
 _STEEPEST = 0.35  # what rises faster than this is a wall, a car or a kerb, never the road
@@ -355,88 +350,3 @@ def _heights_above(points: Float32Array, plane: Float64Array, ground: Float32Arr
         north = ground[row + 1, column] + (ground[row + 1, column + 1] - ground[row + 1, column]) * fu
         heights[i] = z - (a * x + b * y + c) - (south + (north - south) * fv)
     return heights
-
-
-# --- the ground in an aerial survey -------------------------------------------------------------------------------
-
-
-_TREND_M = 20.0  # smoothing of the terrain that the second pass takes away
-_NOISE_M = 0.3  # an opening always lowers rough ground by this much
-
-
-def classify_ground(
-    points: Float64Array,
-    cell_m: float = 1.0,
-    *,
-    slope: float = 0.1,
-    largest_window_m: float = 40.0,
-    tolerance_m: float = 0.3,
-) -> BoolArray:
-    """Return the mask (N,) of ground points in an aerial survey without classes.
-
-    Points (N, 3) easting, northing, height, metres. A progressive morphological filter after Zhang et al. (2003) and
-    SMRF (Pingel et al. 2013): openings of the lowest-point raster with windows that grow up to `largest_window_m`
-    either way, which must exceed half the width of the widest building. What one opening lowers by more than `slope`
-    times its window, or all so far by half as much again, is an object. A second pass sees the raster less the smooth
-    terrain that the first one found, so that hills and hillsides do not count as slope. A point is ground within
-    `tolerance_m` of the terrain that is left, plus what the terrain's own steepness adds within a cell.
-    """
-    check_points(points)
-    if not (cell_m > 0 and slope > 0 and largest_window_m > 0 and tolerance_m > 0):
-        raise CloudError("cell_m, slope, largest_window_m and tolerance_m must be positive")
-    mask = np.zeros(len(points), np.bool_)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        return mask
-    easting, northing, z = np.asarray(points, np.float64)[finite].T
-    # A rim of one cell keeps points on the upper edges inside.
-    bounds = (easting.min(), northing.min(), easting.max() + cell_m, northing.max() + cell_m)
-    lowest = lowest_raster(np.column_stack([easting, northing, z]), bounds, cell_m).values.astype(np.float64)
-    lowest[_is_pit(lowest, cell_m)] = np.nan
-    terrain = _terrain(lowest, slope, cell_m, largest_window_m)
-    steepness = np.hypot(*np.gradient(terrain, cell_m)) if min(terrain.shape) > 1 else np.zeros_like(terrain)
-    below = Raster(terrain.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
-    steep = Raster(steepness.astype(np.float32), bounds[0], bounds[3], cell_m).sample(easting, northing)
-    mask[finite] = np.abs(z - below) <= tolerance_m + 0.5 * steep * cell_m
-    return mask
-
-
-def _terrain(lowest: Float64Array, slope: float, cell_m: float, largest_window_m: float) -> Float64Array:
-    """Return the terrain under the lowest points, NaN where a cell has none."""
-    holes = np.isnan(lowest)
-    surface = _filled(lowest)
-    trend = np.zeros_like(surface)
-    for _ in range(2):
-        objects = _objects(surface - trend, slope, cell_m, largest_window_m)
-        terrain = _filled(np.where(objects | holes, np.nan, surface))
-        trend = ndimage.gaussian_filter(terrain, _TREND_M / cell_m, mode="nearest")
-    return terrain
-
-
-def _objects(surface: Float64Array, slope: float, cell_m: float, largest_window_m: float) -> BoolArray:
-    """Return the cells (H, W) that growing openings of the surface lower by more than terrain would be."""
-    objects = np.zeros(surface.shape, np.bool_)
-    opened = surface
-    radius = 1
-    while True:
-        lower = ndimage.grey_opening(opened, size=(2 * radius + 1, 2 * radius + 1))
-        allowed = slope * radius * cell_m
-        objects |= opened - lower > max(_NOISE_M, allowed)
-        objects |= surface - lower > max(_NOISE_M, 1.5 * allowed)
-        opened = lower
-        if radius * cell_m >= largest_window_m or 2 * radius >= max(surface.shape):
-            return objects
-        radius = max(radius + 1, int(radius * 1.3))
-
-
-def _filled(values: Float64Array) -> Float64Array:
-    """Return the raster (H, W) without holes."""
-    return fill_holes(values.astype(np.float32)).astype(np.float64)
-
-
-def _is_pit(raster: npt.NDArray[np.float64], cell_m: float) -> BoolArray:
-    """Return the cells that lie far below all their neighbours: reflections, not terrain."""
-    filled = np.where(np.isfinite(raster), raster, np.inf)
-    around = ndimage.minimum_filter(filled, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
-    pits: BoolArray = np.isfinite(around) & (filled < around - max(5.0 * cell_m, 2.0))
-    return pits

@@ -1,4 +1,4 @@
-"""Height rasters of a tile: the terrain, with its holes filled, the surface, and the lowest echoes."""
+"""Rasters of a tile: the terrain, with its holes filled, the surface, the lowest echoes, and how many there are."""
 
 from __future__ import annotations
 
@@ -85,6 +85,16 @@ def lowest_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raster
     check_points(points)
     upside_down = surface_raster(np.column_stack([points[:, :2], -points[:, 2]]), bounds, cell_m)
     return Raster(-upside_down.values, upside_down.west_m, upside_down.north_m, cell_m)
+
+
+def count_raster(points: Float64Array, bounds: Bounds, cell_m: float) -> Raster:
+    """Return how many of the points (N, 3) lie in each cell of `bounds`, 0 where there is none."""
+    check_points(points)
+    height, width = _shape(bounds, cell_m)
+    every = np.ones(len(points), np.bool_)
+    values = np.ascontiguousarray(points, np.float64)
+    _, counts = _accumulate(values, every, bounds[0], bounds[3], cell_m, height, width)
+    return Raster(counts.astype(np.float32), bounds[0], bounds[3], cell_m)
 
 
 def fill_holes(values: Float32Array) -> Float32Array:

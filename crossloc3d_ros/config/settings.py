@@ -110,16 +110,15 @@ def unknown_setting(name: str, known: Iterable[str], noun: str = "setting") -> s
 
 def check_value(name: str, hint: Any, value: Any, metadata: Mapping[str, Any]) -> Any:
     """Return `value` converted to the field's type, or raise ConfigError naming the setting."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        if value is None and type(None) in typing.get_args(hint):
+            return None
+        hint = next(a for a in typing.get_args(hint) if a is not type(None))
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
             raise ConfigError(f"'{name}' must be a group of settings, got {value!r}")
         return from_dict(typing.cast(type[Any], hint), value, where=f"{name}.")
     origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in typing.get_args(hint):
-            return None
-        hint = next(a for a in typing.get_args(hint) if a is not type(None))
-        origin = typing.get_origin(hint)
     if origin is Literal:
         if value not in typing.get_args(hint):
             raise ConfigError(f"'{name}' must be one of {', '.join(map(str, typing.get_args(hint)))}, got {value!r}")

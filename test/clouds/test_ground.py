@@ -1,4 +1,4 @@
-"""The ground: found under a robot in every street and slope it may stand on, and in surveys without classes."""
+"""The ground is found under a robot in every street and slope it may stand on."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crossloc3d_ros.clouds.ground import classify_ground, scan_heights
-from crossloc3d_ros.clouds.raster import surface_raster, terrain_raster
+from crossloc3d_ros.clouds.ground import scan_heights
 from crossloc3d_ros.errors import CloudError
 
 Array = npt.NDArray[np.float64]
@@ -223,87 +222,3 @@ def test_a_scan_takes_a_few_milliseconds(cast: Cast) -> None:
         scan_heights(points, HEIGHT_M)
         seconds.append(time.thread_time() - start)
     assert min(seconds) < 0.005
-
-
-# --- aerial -----------------------------------------------------------------------------------------------------
-
-
-def a_survey(terrain: Callable[[Array, Array], Array], seed: int = 0) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """150 x 150 m at 4 points/m2: houses up to 40 m wide, sheds, cars and trees on the terrain; mask of its ground."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(0, 150, (2, 90_000))
-    above = np.zeros(len(x))
-    for cx, cy, w, d, h in [(40, 40, 40, 30, 9), (100, 45, 14, 50, 6), (60, 110, 60, 12, 12), (120, 115, 5, 4, 2.6)]:
-        above[(abs(x - cx) < w / 2) & (abs(y - cy) < d / 2)] = h
-    for cx, cy in rng.uniform(5, 145, (25, 2)):
-        above[(abs(x - cx) < 2.1) & (abs(y - cy) < 0.9)] = 1.5
-    crowns = rng.uniform(5, 145, (15, 2))
-    for cx, cy in crowns:
-        canopy = (np.hypot(x - cx, y - cy) < 4) & (rng.uniform(size=len(x)) < 0.8)
-        above[canopy] = np.maximum(above[canopy], rng.uniform(3, 9, int(canopy.sum())))
-    z = terrain(x, y) + above + rng.normal(0, 0.04, len(x))
-    return np.column_stack([x + 628_000, y + 5_803_000, z]), above == 0
-
-
-@pytest.mark.parametrize(
-    "terrain",
-    [plane(0, 0), plane(0.2, 0), plane(0.1, -0.1), lambda x, y: 6 * np.sin(x / 40) + 5 * np.cos(y / 35)],
-    ids=["flat", "20 % slope", "diagonal slope", "hills"],
-)
-def test_aerial_ground_is_separated_from_houses_cars_and_trees(terrain: Callable[[Array, Array], Array]) -> None:
-    points, ground = a_survey(terrain)
-    found = classify_ground(points)
-    assert np.mean(ground[found]) > 0.985  # precision
-    assert np.mean(found[ground]) > 0.95  # recall
-
-
-def test_stray_aerial_points_are_not_ground_and_spoil_nothing() -> None:
-    points, _ = a_survey(plane(0.05, 0))
-    clean = classify_ground(points)
-    stray = np.array([[628_050.0, 5_803_050.0, -40.0], [628_070.0, 5_803_020.0, 300.0], [np.nan, 5_803_020.0, 1.0]])
-    found = classify_ground(np.vstack([points, stray]))
-    assert not found[-3:].any()
-    assert np.mean(found[:-3] == clean) > 0.999
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_almost_no_aerial_points_are_classified_too(count: int) -> None:
-    points = np.array([[10.0, 20.0, 3.0], [11.5, 20.0, 3.1]])[:count]
-    assert classify_ground(points).tolist() == [True] * count
-
-
-def test_an_aerial_point_in_another_world_is_named() -> None:
-    with pytest.raises(CloudError, match="stray points"):
-        classify_ground(np.array([[0.0, 0.0, 0.0], [1e9, 1e9, 0.0]]))
-
-
-@pytest.mark.parametrize(
-    ("tile", "precision", "recall", "terrain_rmse_m"),
-    [
-        ("delft_AHN3_2014_EPSG28992.laz", 0.945, 0.995, 0.10),
-        pytest.param("amsterdam_centre_AHN3_2014_EPSG28992.laz", 0.895, 0.99, 0.25, marks=pytest.mark.slow),
-        pytest.param("amsterdam_centre_AHN2_2010_EPSG28992.laz", 0.885, 0.98, 0.32, marks=pytest.mark.slow),
-    ],
-)
-def test_real_tiles_against_their_class_2(
-    shared: Callable[[str], Any], tile: str, precision: float, recall: float, terrain_rmse_m: float
-) -> None:
-    """Measured: Delft 0.952 / 0.998, Amsterdam AHN3 0.905 / 0.994, AHN2 0.894 / 0.985.
-
-    Half of what the survey does not call ground lies within 0.15 m of it: canals, decks, kerbs, low plants. So
-    the third claim matters more: objects above 1.5 m are not taken, and the terrain differs by decimetres.
-    """
-    laspy = pytest.importorskip("laspy")
-    las = laspy.read(shared(f"data/aerial/{tile}"))
-    points = np.column_stack([las.x, las.y, las.z])
-    truth = np.asarray(las.classification) == 2
-    found = classify_ground(points)
-    assert np.mean(truth[found]) > precision
-    assert np.mean(found[truth]) > recall
-
-    bounds = (*points[:, :2].min(axis=0), *(points[:, :2].max(axis=0) + 0.01))
-    own, theirs = terrain_raster(points, found, bounds, 1.0), terrain_raster(points, truth, bounds, 1.0)
-    assert np.sqrt(np.mean((own.values - theirs.values) ** 2)) < terrain_rmse_m
-    high = points[:, 2] - theirs.sample(points[:, 0], points[:, 1]) > 1.5
-    assert np.mean(found[high]) < 0.001
-    assert np.nanmax(surface_raster(points, bounds, 1.0).values) == pytest.approx(points[:, 2].max(), abs=1e-4)
