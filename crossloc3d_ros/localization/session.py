@@ -19,6 +19,7 @@ from crossloc3d_ros.localization.estimates import no_estimate
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
 from crossloc3d_ros.localization.fusion.priors import PosePrior
+from crossloc3d_ros.localization.motion_compensation import MotionCompensation
 from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
 
 OdometryKind = Literal["topic", "scan", "none"]
@@ -36,6 +37,8 @@ class Outcome:
     estimate: Estimate
     is_fault: bool = False
     """The scan could not be used: it could not be read, or localizing it failed. The estimate has no fix."""
+    within_turn: str = ""
+    """What was done with the motion within a turn, and why not more; empty where the scan did not get that far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,7 @@ class Session:
         self._priors: list[PosePrior] = []
         self._odometry = OdometryBuffer(config.fusion) if odometry == "topic" else None
         self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m) if odometry == "scan" else None
+        self._compensation = MotionCompensation(config)
 
     def reset(self) -> None:
         """Forget the hypotheses, the priors and what the IMU measured: the robot may be anywhere, in any attitude."""
@@ -110,6 +114,7 @@ class Session:
         """Use other settings from the next scan on; hypotheses, priors and the odometry received so far are kept."""
         mounting = self.localizer.config.scan.mounting
         self.localizer.reconfigure(config)
+        self._compensation.reconfigure(config)
         if self._odometry is not None:
             self._odometry.reconfigure(config.fusion)
         if self._scan_odometry is not None:
@@ -157,6 +162,8 @@ class Session:
         """
         config = self.localizer.config.scan
         mounting = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
+        if self._odometry is None:  # from a topic, the motion of this turn may arrive later
+            scan = self._compensation(scan, mounting, self._scan_odometry)
         if self._scan_odometry is not None:
             ranges = np.linalg.norm(scan.points, axis=1)
             used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
@@ -170,6 +177,8 @@ class Session:
         `wait_for_odometry(stamp_ns)` is called when the motion is needed and the odometry of that stamp is missing.
         """
         scan, localizer = received.scan, self.localizer
+        if self._odometry is not None:
+            scan = self._compensation(scan, received.T_base_lidar, self._odometry)
 
         def motion() -> Motion | None:
             source = self._scan_odometry if self._odometry is None else self._odometry
@@ -187,7 +196,7 @@ class Session:
         if not len(estimate.candidates):  # nothing was compared with the map: what was known before still holds
             estimate = replace(estimate, state=self.state)
         self.state = estimate.state
-        return Outcome(estimate)
+        return Outcome(estimate, within_turn=self._compensation.words)
 
     def fault(self, stamp_ns: int, reason: str) -> Outcome:
         """Return the outcome of a scan that says nothing: no fix, and the state that it was."""

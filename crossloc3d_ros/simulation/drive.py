@@ -99,9 +99,10 @@ def drive(
 ) -> DriveReport:
     """Drive the route through the world and write the recording to the new folder `path`.
 
-    `profile` is the lidar, which `config.sensor` describes further. `frame` is the ENU frame of `/ground_truth/odom`, by default at the world's origin; `progress` is called with
-    stage, done, total and unit. Raises BagError where the folder exists or cannot be written, RouteError where the
-    route is shorter than one turn of the sensor; an interrupted drive leaves no bag.
+    `profile` is the lidar, which `config.sensor` describes further. `frame` is the ENU frame of `/ground_truth/odom`,
+    by default at the world's origin; `progress` is called with stage, done, total and unit. Raises BagError where the
+    folder exists or cannot be written, RouteError where the route is shorter than one turn of the sensor; an
+    interrupted drive leaves no bag.
     """
     config = config or DriveConfig()
     if route.duration_s <= 1.0 / config.sensor.rate_hz:

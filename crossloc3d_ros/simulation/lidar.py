@@ -20,7 +20,7 @@ from crossloc3d_ros.config import option
 from crossloc3d_ros.formats.messages import CloudLayout
 from crossloc3d_ros.simulation.scene import Label, Scene
 from crossloc3d_ros.simulation.traffic import Movers
-from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array, Scan
+from crossloc3d_ros.types import BoolArray, Float32Array, Float64Array, Int32Array, PointTimes, Scan
 
 _WEDGE_HZ = (121.6, -77.7)
 """Turns a second of the two wedge prisms of a rosette. They have no common period within seconds, so that each turn
@@ -80,7 +80,7 @@ class LidarScan:
 
     def as_scan(self, stamp_ns: int = 0, frame_id: str = "velodyne") -> Scan:
         """Return the points as the localizer takes them."""
-        return Scan(self.points, stamp_ns, frame_id)
+        return Scan(self.points, stamp_ns, frame_id, PointTimes("time", self.time))
 
 
 _REFLECTIVITY = np.zeros((8, 2), dtype=np.float32)

@@ -55,7 +55,7 @@ def at(height_m: float) -> np.ndarray:
 def test_the_vlp16_measures_what_it_measured_before() -> None:
     twist = np.array([2.0, 0.1, 0.0, 0.01, 0.02, 0.6])
     scan = Vlp16().scan(yard(), at(1.2), np.random.default_rng(11), twist)
-    # On another processor the last bit of a ray may move a range by one step of 2 mm, or one weak echo across the limit.
+    # Elsewhere the last bit of a ray may move a range by one step of 2 mm, or one weak echo across the limit.
     assert len(scan.points) == pytest.approx(16_204, abs=3)
     assert int(scan.ring.sum()) == pytest.approx(82_289, abs=45)
     np.testing.assert_allclose(np.linalg.norm(scan.points, axis=1).sum(dtype=np.float64), 176_055.946, atol=120.0)
