@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import replace
 from typing import Protocol
@@ -15,12 +14,8 @@ from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion
 from crossloc3d_ros.types import Float32Array, Float64Array, Scan
 
-log = logging.getLogger(__name__)
-
 _KNOT_S = 0.0125
-"""Odometry is asked so often: at 120 degrees a second a point 100 m away is interpolated to 2 cm."""
-
-_DONE, _LEFT = "compensated", "not compensated"
+"""Odometry is asked so often: at 120 degrees a second a point 100 m away is interpolated to 1 cm."""
 
 
 class MotionSource(Protocol):
@@ -58,17 +53,12 @@ class MotionCompensation:
         path = self._path(scan.stamp_ns, times.seconds, source)
         if isinstance(path, str):
             return self._left(scan, path)
-        if not self.words.startswith(_DONE):
-            log.info("motion within a turn is compensated: %s", times.words)
-        self.words = f"{_DONE}: {times.words}"
+        self.words = f"compensated: {times.words}"
         points = deskew(scan.points, times.seconds, *path, T_base_lidar, self._config.scan)
         return replace(scan, points=points, times=None, is_at_stamp=True)
 
     def _left(self, scan: Scan, why: str) -> Scan:
-        """Return the scan as it is; log it once, and again when compensation ends."""
-        if not self.words.startswith(_LEFT):
-            log.warning("motion within a turn is not compensated: %s", why)
-        self.words = f"{_LEFT}: {why}"
+        self.words = f"not compensated: {why}"
         return scan
 
     def _path(
