@@ -17,12 +17,38 @@ from crossloc3d_ros.types import Float32Array, Float64Array, Scan
 _KNOT_S = 0.0125
 """Odometry is asked so often: at 120 degrees a second a point 100 m away is interpolated to 1 cm."""
 
+_STEADY_NS = 500_000_000
+
 
 class MotionSource(Protocol):
     """What measures how the base moves."""
 
     def motion(self, from_ns: int, to_ns: int) -> Motion:
         """Return how the base moved between two stamps."""
+
+
+class SteadyMotion:
+    """The motion that goes on as over the last half second, for odometry whose single steps are rough.
+
+    KISS-ICP knows the turn at hand only afterwards, and from one scan to the next it errs by centimetres.
+    """
+
+    def __init__(self, source: MotionSource) -> None:
+        """Continue the motion of `source`."""
+        self._source = source
+
+    def motion(self, from_ns: int, to_ns: int) -> Motion:
+        """Return how the base moves between two stamps, by its motion before the first; unknown where that is."""
+        before = self._source.motion(from_ns - _STEADY_NS, from_ns)
+        if not before.is_known:
+            return before
+        share = (to_ns - from_ns) / _STEADY_NS
+        forward, left, turn = before.delta
+        # Along an arc: the chord of a part of it is shorter, and turned by less of the angle.
+        direction = math.atan2(left, forward) - 0.5 * turn + 0.5 * share * turn
+        chord_m = share * math.hypot(forward, left)
+        delta = np.array([chord_m * math.cos(direction), chord_m * math.sin(direction), share * turn])
+        return replace(before, delta=delta, covariance=share**2 * before.covariance)
 
 
 class MotionCompensation:
@@ -40,6 +66,10 @@ class MotionCompensation:
         """Use other settings from the next scan on; the clouds' times are judged anew."""
         self._config = config
         self._clock = PointClock(config.scan.period_s, config.scan.stamped_at)
+
+    def needs_motion(self, scan: Scan) -> bool:
+        """Return whether the motion of a scan's turn would be used."""
+        return scan.times is not None and self._config.scan.deskew != "off"
 
     def __call__(self, scan: Scan, T_base_lidar: Float64Array, source: MotionSource | None) -> Scan:
         """Return the scan at the moment of its stamp; as it is where times or motion are missing or `deskew` is off."""

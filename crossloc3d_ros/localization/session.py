@@ -19,7 +19,7 @@ from crossloc3d_ros.localization.estimates import no_estimate
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
 from crossloc3d_ros.localization.fusion.priors import PosePrior
-from crossloc3d_ros.localization.motion_compensation import MotionCompensation
+from crossloc3d_ros.localization.motion_compensation import MotionCompensation, SteadyMotion
 from crossloc3d_ros.localization.scan_checks import ScanChecks
 from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
 
@@ -172,7 +172,8 @@ class Session:
         if fault:
             return PreparedInput(scan, mounting, up, self._heading, fault)
         if self._odometry is None:  # from a topic, the motion of this turn may arrive later
-            scan = self._compensation(scan, mounting, self._scan_odometry)
+            steady = None if self._scan_odometry is None else SteadyMotion(self._scan_odometry)
+            scan = self._compensation(scan, mounting, steady)
         if self._scan_odometry is not None:
             ranges = np.linalg.norm(scan.points, axis=1)
             used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
@@ -187,10 +188,6 @@ class Session:
         scan, localizer = received.scan, self.localizer
         if received.fault:
             return self.fault(scan.stamp_ns, received.fault)
-        if self._odometry is not None:
-            if scan.times is not None:
-                self._await_odometry(scan.stamp_ns, wait_for_odometry)
-            scan = self._compensation(scan, received.T_base_lidar, self._odometry)
 
         def motion() -> Motion | None:
             source = self._scan_odometry if self._odometry is None else self._odometry
@@ -200,6 +197,10 @@ class Session:
             return source.motion(localizer.stamp_ns, scan.stamp_ns)
 
         try:
+            if self._odometry is not None:
+                if self._compensation.needs_motion(scan):
+                    self._await_odometry(scan.stamp_ns, wait_for_odometry)
+                scan = self._compensation(scan, received.T_base_lidar, self._odometry)
             self._hand_over_priors(received)
             estimate = localizer.localize(scan, received.up_base, received.T_base_lidar, motion)
         except CrossLocError as error:

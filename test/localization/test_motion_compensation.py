@@ -14,8 +14,8 @@ from crossloc3d_ros.config import LocalizerConfig, MountingConfig, ScanConfig
 from crossloc3d_ros.errors import CloudError
 from crossloc3d_ros.formats.messages import lidar_cloud
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
-from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
-from crossloc3d_ros.localization.motion_compensation import MotionCompensation
+from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer, ScanOdometry
+from crossloc3d_ros.localization.motion_compensation import MotionCompensation, SteadyMotion
 from crossloc3d_ros.simulation import mesh
 from crossloc3d_ros.simulation.lidar import Lidar, LidarScan
 from crossloc3d_ros.simulation.profiles import PROFILES
@@ -156,3 +156,24 @@ def test_a_cloud_without_times_is_said() -> None:
     made = compensation()
     made(Scan(np.ones((10, 3), np.float32), END_NS, "lidar"), T_BASE_LIDAR, odometry())
     assert made.words == "not compensated: the cloud carries no time per point"
+
+
+def test_odometry_from_scan_to_scan_takes_the_motion_out_of_the_next_scan() -> None:
+    """KISS-ICP on scans that are at their stamps' moments: as it goes on, so the next turn is taken to have gone."""
+    pytest.importorskip("kiss_icp")
+    source = ScanOdometry(LocalizerConfig().fusion)
+    made, config = compensation(), dataclasses.replace(PROFILES["vlp-16"].config, range_error_m=0.0, body=())
+    R, rng = T_BASE_LIDAR[:3, :3], np.random.default_rng(1)
+    twist = np.concatenate([R.T @ np.array([SPEED_M_S, 0.0, 0.0]), np.zeros(3)])
+    off = []
+    for i in range(14):
+        T_hall_base = np.eye(4)
+        T_hall_base[0, 3] = -4.0 + SPEED_M_S * 0.1 * i
+        turn = Lidar(PROFILES["vlp-16"], config).scan(hall(), T_hall_base @ T_BASE_LIDAR, rng, twist)
+        scan = made(turn.as_scan(END_NS + i * 100_000_000), T_BASE_LIDAR, SteadyMotion(source))
+        source.add(scan.stamp_ns, transform_points(T_BASE_LIDAR, scan.points))
+        points = transform_points(T_hall_base @ T_BASE_LIDAR, scan.points.astype(np.float64))
+        off.append(np.quantile(np.abs(np.abs(points[:, :2]).max(axis=1) - HALF_M), 0.95))
+    assert made.words.startswith("compensated"), made.words
+    assert off[0] > 0.2
+    assert max(off[-4:]) < 0.05
