@@ -24,6 +24,8 @@ _SINCE_1970_S = 1e6
 _OTHER_MOMENT = 0.25
 """Of a turn: as far from `stamped_at`, the times contradict it."""
 
+_SAME = "field '{}' gives all points the same time"
+
 
 @dataclass(frozen=True, eq=False)
 class Times:
@@ -75,6 +77,8 @@ class PointClock:
         if len(finite) == 0:
             return Times(None, f"field '{kind.field}' holds no number")
         first, last = float(finite.min()), float(finite.max())
+        if first == last and len(finite) > 1:
+            return Times(None, _SAME.format(kind.field))
         if last - first > _MOST_TURN * self._period_s or max(-first, last) > _MOST_TURN * self._period_s:
             return Times(
                 None,
@@ -92,7 +96,7 @@ class PointClock:
         low, high = known.min(), known.max()
         span = float(high) - float(low) if times.values.dtype.kind == "f" else float(int(high) - int(low))
         if span == 0.0:
-            return f"field '{times.field}' gives all points the same time"
+            return _SAME.format(times.field)
         turns = {unit: span * scale / self._period_s for unit, scale in _UNITS_S.items()}
         units = [unit for unit, share in turns.items() if _LEAST_TURN <= share <= _MOST_TURN]
         if not units:

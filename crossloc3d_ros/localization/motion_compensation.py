@@ -102,7 +102,7 @@ class MotionCompensation:
         knots_s = np.linspace(first_s, max(last_s, first_s + 1e-3), max(2, math.ceil((last_s - first_s) / _KNOT_S) + 1))
         poses = np.tile(np.eye(4), (len(knots_s), 1, 1))
         for T, knot_s in zip(poses, knots_s, strict=True):
-            since_ns = round(knot_s * 1e9)
+            since_ns = 1000 * round(knot_s * 1e6)  # float32 keeps no nanoseconds of a tenth of a second
             if since_ns == 0:
                 continue
             begin_ns, end_ns = sorted((stamp_ns, stamp_ns + since_ns))

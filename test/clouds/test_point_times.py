@@ -77,6 +77,7 @@ def test_the_unit_is_chosen_once_and_every_cloud_is_held_to_it() -> None:
     # The same field in microseconds all of a sudden lies within the turn, but in seconds it does not.
     assert clock.read(scan("t", (AFTER_NS * 1000))).seconds is None, "another type: judged anew, and no turn"
     assert clock.read(scan("t", AFTER_NS.astype(np.uint32) * np.uint32(30))).seconds is None
+    assert "the same time" in clock.read(scan("t", np.zeros(2000, np.uint32))).reason, "the driver has lost them"
     assert clock.read(SENT["ouster"][0]).seconds is not None
 
 
