@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,16 @@ UInt8Array = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
+class PointTimes:
+    """When the points of a cloud were measured, as the driver sends it."""
+
+    field: str
+    """Its name in the message."""
+    values: npt.NDArray[Any]
+    """(N,) numbers of the field's own type; unit and origin are the driver's."""
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """One revolution of the LiDAR."""
 
@@ -34,6 +44,10 @@ class Scan:
     """(N, 3), metres, lidar frame; may hold NaN and infinities as drivers send them."""
     stamp_ns: int
     frame_id: str
+    times: PointTimes | None = None
+    """Of the points; None where the cloud carries none."""
+    is_at_stamp: bool = False
+    """Whether each point is where it would have been at the stamp, not at its own time within the revolution."""
 
 
 @dataclass(frozen=True, eq=False)

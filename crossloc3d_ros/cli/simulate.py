@@ -1,4 +1,4 @@
-"""Drive a simulated VLP-16 through a real survey or through a simulated town."""
+"""Drive a simulated lidar through a real survey or through a simulated town."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from crossloc3d_ros.cli import common
+from crossloc3d_ros.config import MountingConfig, from_dict, to_dict
 from crossloc3d_ros.errors import BagError, ConfigError
 from crossloc3d_ros.simulation.drive import DriveConfig, DriveReport, drive
 from crossloc3d_ros.simulation.families import FAMILIES
+from crossloc3d_ros.simulation.lidar import LidarConfig, LidarProfile
+from crossloc3d_ros.simulation.profiles import PROFILES
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly, write_survey
 from crossloc3d_ros.simulation.town import make_town
 from crossloc3d_ros.simulation.traffic import TrafficConfig
+from crossloc3d_ros.simulation.vlp16 import VLP16
 from crossloc3d_ros.simulation.world import World
 
 _SURVEY_OPTIONS = ("spacing_m", "altitude_m", "scan_angle_deg", "overlap", "horizontal_error_m", "vertical_error_m")
 _DRIVE_OPTIONS = ("scan_every", "gnss_rate_hz", "gnss_error_m", "gnss_outages", "gnss_outage_s")
+
+_CLEARANCE_M = 0.05  # below the robot
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,6 +65,13 @@ def _add_route(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed-m-s", type=float, default=2.0, help="cruising speed (default: 2)")
     parser.add_argument("--clearance-m", type=float, default=1.5, help="kept from obstacles (default: 1.5)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag (default: mcap)")
+    parser.add_argument("--lidar", choices=sorted(PROFILES), default=VLP16.name, help=f"model (default: {VLP16.name})")
+    parser.add_argument(
+        "--lidar-height-m", type=float, default=MountingConfig.z_m,
+        help=f"of the lidar above the ground (default: {MountingConfig.z_m:g})",
+    )  # fmt: skip
+    parser.add_argument("--lidar-range-m", type=float, help="largest range (default: the model's)")
+    parser.add_argument("--lidar-range-error-m", type=float, help="one sigma of a range (default: the model's)")
     common.add_options(parser, DriveConfig, _DRIVE_OPTIONS)
     common.add_options(parser, TrafficConfig)
     common.add_verbosity(parser)
@@ -94,7 +107,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> None:
     for name, low, high in (("length_m", 5.0, 20_000.0), ("speed_m_s", 0.1, 10.0), ("clearance_m", 0.6, 20.0),
-                            ("seed", 0, 2**31 - 1)):  # fmt: skip
+                            ("lidar_height_m", 0.3, 3.0), ("seed", 0, 2**31 - 1)):  # fmt: skip
         value = getattr(arguments, name)
         if not low <= value <= high:
             raise ConfigError(f"--{name.replace('_', '-')} must lie between {low:g} and {high:g}, got {value:g}")
@@ -111,8 +124,26 @@ def _drive(
         clearance_m=arguments.clearance_m, speed_m_s=arguments.speed_m_s,
     )  # fmt: skip
     traffic = common.read_options(TrafficConfig, arguments)
-    config = dataclasses.replace(common.read_options(DriveConfig, arguments), traffic=traffic)
-    return drive(world, route, bag_path, config, seed=arguments.seed, storage=arguments.storage, progress=progress)
+    profile = PROFILES[arguments.lidar]
+    config = dataclasses.replace(
+        common.read_options(DriveConfig, arguments),
+        traffic=traffic,
+        mounting=MountingConfig(z_m=arguments.lidar_height_m),
+        sensor=_sensor(profile, arguments),
+    )
+    return drive(
+        world, route, bag_path, config, seed=arguments.seed, profile=profile, storage=arguments.storage,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _sensor(profile: LidarProfile, arguments: argparse.Namespace) -> LidarConfig:
+    """Return the settings of the lidar; of the robot's body below it, what lies above the ground."""
+    given = {"max_range_m": arguments.lidar_range_m, "range_error_m": arguments.lidar_range_error_m}
+    values = {**to_dict(profile.config), **{name: value for name, value in given.items() if value is not None}}
+    boxes = np.asarray(profile.config.body, dtype=np.float64).reshape(-1, 6)
+    boxes[:, 2] = np.maximum(boxes[:, 2], -arguments.lidar_height_m + _CLEARANCE_M)
+    return from_dict(LidarConfig, {**values, "body": boxes[boxes[:, 2] < boxes[:, 5]].ravel().tolist()})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Every setting in one place: frozen dataclasses from which ROS parameters, YAML files and command lines are made.
 
-The simulator's own settings (`DriveConfig`, `TrafficConfig`, `SurveyConfig`, `Vlp16Config`) stay in `simulation`: a
+The simulator's own settings (`DriveConfig`, `TrafficConfig`, `SurveyConfig`, `LidarConfig`) stay in `simulation`: a
 simulated benchmark on disk is known by a digest of the sources that made it, among them those of the sensors and of
 the traffic, so that moving these classes would make every benchmark anew. `DriveConfig` is composed of them.
 """

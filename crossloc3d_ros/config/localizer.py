@@ -46,6 +46,10 @@ class ScanConfig:
     mounting: MountingConfig = field(
         default_factory=MountingConfig, metadata={"text": "pose of the lidar in the base frame"}
     )
+    deskew: Literal["auto", "off"] = option(
+        "auto",
+        "motion within a revolution: taken out where the points carry times and odometry tells the motion, or left in",
+    )
 
     def __post_init__(self) -> None:
         """Refuse what no point could pass."""

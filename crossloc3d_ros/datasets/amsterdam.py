@@ -24,10 +24,11 @@ from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet, join_pla
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.simulated import scan_places, sources_digest
 from crossloc3d_ros.errors import EvaluationError, MapError
-from crossloc3d_ros.simulation import mesh, real_world, route, scene, vlp16, world
+from crossloc3d_ros.simulation import lidar, mesh, real_world, route, scene, vlp16, world
+from crossloc3d_ros.simulation.lidar import LidarConfig
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
-from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
+from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float64Array
 
@@ -55,7 +56,7 @@ class AmsterdamBenchmark:
     """The scans at random places lie at least so far inside the survey of 2014."""
     clearance_m: float = 1.5
     scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
-    sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
+    sensor: LidarConfig = dataclasses.field(default_factory=LidarConfig)
     build: BuildConfig = dataclasses.field(default_factory=BuildConfig)
 
 
@@ -83,7 +84,7 @@ def settings_of(benchmark: AmsterdamBenchmark, surveys: Path, preprocessing: Pre
     settings = dataclasses.asdict(benchmark)
     for name in ("workers", "chunk_points"):  # how the builder works, not what comes out
         del settings["build"][name]
-    for name in ("period_s", "stamped_at"):  # how stamps are read, not what is seen
+    for name in ("period_s", "stamped_at", "deskew"):  # how stamps are read, not what is seen
         del settings["scan"][name]
     for name in (MAP_SURVEY, DRIVE_SURVEY):
         if not (surveys / name).is_file():
@@ -93,7 +94,7 @@ def settings_of(benchmark: AmsterdamBenchmark, surveys: Path, preprocessing: Pre
         "benchmark": settings,
         "preprocessing": to_dict(preprocessing),
         "surveys": {name: sha256(surveys / name) for name in (MAP_SURVEY, DRIVE_SURVEY)},
-        "simulator": sources_digest(real_world, mesh, world, route, scene, vlp16),
+        "simulator": sources_digest(real_world, mesh, world, route, scene, lidar, vlp16),
     }
 
 

@@ -43,7 +43,7 @@ from crossloc3d_ros.formats.bag import open_bag, stamp_ns_of
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.simulation import drive as recording
-from crossloc3d_ros.simulation import route, traffic, vlp16
+from crossloc3d_ros.simulation import lidar, route, traffic, vlp16
 from crossloc3d_ros.simulation.drive import DriveConfig, drive
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.route import plan_route
@@ -280,7 +280,7 @@ def settings_of_plan(plan: DrivePlan) -> dict[str, Any]:
         {
             "version": VERSION,
             "plan": dataclasses.asdict(plan),
-            "sources": sources_digest(recording, route, traffic, vlp16),
+            "sources": sources_digest(recording, route, traffic, lidar, vlp16),
         }
     )
 

@@ -32,7 +32,7 @@ from crossloc3d_ros.datasets.set_maps import Progress, make_map
 from crossloc3d_ros.datasets.simulated import SIMULATED, BenchmarkTown, SimulatedBenchmark, raw_scans, sources_digest
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.files import write_atomically
-from crossloc3d_ros.simulation import survey, vlp16
+from crossloc3d_ros.simulation import lidar, survey, vlp16
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.survey import fly, write_survey
 from crossloc3d_ros.simulation.town import make_town
@@ -277,7 +277,7 @@ def settings_of(poses: SimulatedPoses) -> dict[str, Any]:
             "poses": settings,
             "seam_m": SEAM_M,
             "towns": hashlib.sha256("".join(digests).encode()).hexdigest()[:16],
-            "sensors": sources_digest(vlp16, survey),
+            "sensors": sources_digest(lidar, vlp16, survey),
         }
     )
 

@@ -26,10 +26,11 @@ from crossloc3d_ros.config import BuildConfig, MountingConfig, PreprocessingConf
 from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.formats.las import GROUND
-from crossloc3d_ros.simulation import survey, vlp16
+from crossloc3d_ros.simulation import lidar, survey, vlp16
+from crossloc3d_ros.simulation.lidar import LidarConfig
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import make_town
-from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
+from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float32Array, Float64Array
 
@@ -72,7 +73,7 @@ class SimulatedBenchmark:
     """Share of the scans that an IMU levels."""
     sensor_height_m: tuple[float, float] = (0.9, 1.6)
     flight: SurveyConfig = dataclasses.field(default_factory=SurveyConfig)
-    sensor: Vlp16Config = dataclasses.field(default_factory=Vlp16Config)
+    sensor: LidarConfig = dataclasses.field(default_factory=LidarConfig)
     build: BuildConfig = dataclasses.field(default_factory=BuildConfig)
     """How the map's builder cuts submaps."""
 
@@ -142,7 +143,7 @@ def settings_of(benchmark: SimulatedBenchmark, preprocessing: PreprocessingConfi
         "benchmark": settings,
         "preprocessing": to_dict(preprocessing),
         "towns": hashlib.sha256("".join(digests).encode()).hexdigest()[:16],
-        "sensors": sources_digest(vlp16, survey),
+        "sensors": sources_digest(lidar, vlp16, survey),
     }
 
 

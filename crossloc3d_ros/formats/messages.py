@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,68 @@ VELODYNE_POINT = np.dtype(
         "itemsize": 22,
     }
 )
+
+# What Ouster's driver sends by default: aligned for PCL, 48 bytes a point; `t` in nanoseconds from the stamp.
+OUSTER_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
+        "itemsize": 48,
+    }
+)
+# What Hesai's driver sends: 26 bytes a point; `timestamp` in seconds since 1970.
+HESAI_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "timestamp"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f8"],
+        "offsets": [0, 4, 8, 12, 16, 18],
+        "itemsize": 26,
+    }
+)
+# Livox's custom message as a cloud: `offset_time` in nanoseconds from the stamp.
+LIVOX_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "tag", "line", "offset_time"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "u1", "u1", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 17, 18],
+        "itemsize": 22,
+    }
+)
+CloudLayout = Literal["velodyne", "ouster", "hesai", "livox"]
+"""Whose driver lays out a cloud."""
+
+
+def lidar_cloud(
+    layout: CloudLayout,
+    stamp_ns: int,
+    frame_id: str,
+    points: npt.ArrayLike,
+    intensity: npt.ArrayLike,
+    ring: npt.ArrayLike,
+    time_s: npt.ArrayLike,
+) -> PointCloud2:
+    """Build the PointCloud2 of a maker's driver: its fields, types and offsets.
+
+    `points` (N, 3) metres in the lidar frame; `intensity`, `ring`, `time_s` (N,), time relative to the stamp. What
+    `ouster` and `livox` would have before it is sent as at the stamp: their times have no sign.
+    """
+    if layout == "velodyne":
+        return velodyne_cloud(stamp_ns, frame_id, points, intensity, ring, time_s)
+    xyz = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+    kind = {"ouster": OUSTER_POINT, "hesai": HESAI_POINT, "livox": LIVOX_POINT}[layout]
+    table = np.zeros(len(xyz), dtype=kind)
+    table["x"], table["y"], table["z"] = xyz.T
+    table["intensity"] = intensity
+    since_stamp_ns = np.rint(np.asarray(time_s, dtype=np.float64) * 1e9).astype(np.int64)
+    if layout == "hesai":
+        table["ring"], table["timestamp"] = ring, (stamp_ns + since_stamp_ns) * 1e-9
+    elif layout == "ouster":
+        table["ring"], table["t"], table["reflectivity"] = ring, np.maximum(since_stamp_ns, 0), intensity
+        table["range"] = np.rint(1e3 * np.linalg.norm(xyz, axis=1))
+    else:
+        table["line"], table["offset_time"] = ring, np.maximum(since_stamp_ns, 0)
+    return structured_cloud(stamp_ns, frame_id, table)
 
 
 def velodyne_cloud(

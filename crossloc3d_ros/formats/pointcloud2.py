@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from crossloc3d_ros.errors import CloudError
-from crossloc3d_ros.types import Float32Array, Scan
+from crossloc3d_ros.types import PointTimes, Scan
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy type of each number that `sensor_msgs/PointField` has for a type."""
+TIME_FIELDS = ("time", "t", "timestamp", "offset_time")
+"""What drivers call the time of a point: Velodyne, Ouster, Hesai, Livox."""
 _NAMES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}
 POINT_FIELD_NUMBERS = {np.dtype(code): number for number, code in POINT_FIELD_TYPES.items()}
 
@@ -69,7 +71,7 @@ class PackedCloud:
 
 
 def scan_from_pointcloud2(msg: PointCloud2Like) -> Scan:
-    """Return the message's points (N, 3) float32 in its own frame and order, NaN and all.
+    """Return the message's points (N, 3) float32 in its own frame and order, NaN and all, with their times.
 
     Any field order, offset and padding, padded rows, float32 or float64 coordinates of either endianness, organised
     or not, further fields of any type. Raises CloudError that names what is wrong with the message.
@@ -102,7 +104,13 @@ def scan_from_pointcloud2(msg: PointCloud2Like) -> Scan:
         else:
             for k in range(3):
                 points[..., k] = _column(buffer, dtypes[k], offsets[k], height, width, row_step, point_step, 1)[..., 0]
-    return Scan(points.reshape(-1, 3), stamp_ns, str(msg.header.frame_id))
+    times = None
+    field = next((f for name in TIME_FIELDS for f in msg.fields if f.name == name and int(f.count) <= 1), None)
+    if field is not None and int(field.datatype) in POINT_FIELD_TYPES:
+        offset, dtype = _place(msg, field)
+        values = _column(buffer, dtype, offset, height, width, row_step, point_step, 1).reshape(-1)
+        times = PointTimes(field.name, values.astype(dtype.newbyteorder("=")))
+    return Scan(points.reshape(-1, 3), stamp_ns, str(msg.header.frame_id), times)
 
 
 def pack_columns(columns: Mapping[str, npt.NDArray[Any]]) -> PackedCloud:
@@ -145,12 +153,17 @@ def _coordinate(msg: PointCloud2Like, axis: str) -> tuple[int, np.dtype[Any]]:
         raise CloudError(f"field '{axis}' is {kind}; coordinates must be float32 or float64")
     if count > 1:
         raise CloudError(f"field '{axis}' holds {count} values a point; a coordinate is one")
+    return _place(msg, field)
+
+
+def _place(msg: PointCloud2Like, field: _Field) -> tuple[int, np.dtype[Any]]:
+    """Return the byte offset and dtype of a field of numbers."""
     offset = int(field.offset)
-    dtype = np.dtype(POINT_FIELD_TYPES[datatype]).newbyteorder(">" if msg.is_bigendian else "<")
+    dtype = np.dtype(POINT_FIELD_TYPES[int(field.datatype)]).newbyteorder(">" if msg.is_bigendian else "<")
     if offset < 0:
-        raise CloudError(f"field '{axis}' begins before its point, at byte {offset}")
+        raise CloudError(f"field '{field.name}' begins before its point, at byte {offset}")
     if offset + dtype.itemsize > int(msg.point_step):
-        raise CloudError(f"field '{axis}' ends at byte {offset + dtype.itemsize}, the point at {msg.point_step}")
+        raise CloudError(f"field '{field.name}' ends at byte {offset + dtype.itemsize}, the point at {msg.point_step}")
     return offset, dtype
 
 
@@ -165,7 +178,7 @@ def _as_bytes(data: Any) -> npt.NDArray[np.uint8]:
 def _column(
     buffer: npt.NDArray[np.uint8], dtype: np.dtype[Any], offset: int, height: int, width: int, row_step: int,
     point_step: int, count: int,
-) -> Float32Array:  # fmt: skip
+) -> npt.NDArray[Any]:  # fmt: skip
     """Return a (height, width, count) view of `count` neighbouring values of each point."""
     strides = (row_step, point_step, dtype.itemsize)
     return np.ndarray((height, width, count), dtype, buffer=buffer, offset=offset, strides=strides)

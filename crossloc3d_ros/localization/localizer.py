@@ -87,7 +87,7 @@ class Localizer:
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, frame, place, candidates, prepared.counts, watch)
         motion = motion() if callable(motion) else motion
-        step = self._within_revolution(scan.stamp_ns, motion)
+        step = self._within_revolution(scan, motion)
         hypotheses = self._tracker.predict(scan.stamp_ns, motion)
         aligned = moved(self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses), step)
         watch.lap("align_ms")
@@ -171,10 +171,13 @@ class Localizer:
                     alignment.search_map()
         return alignment.result()
 
-    def _within_revolution(self, stamp_ns: int, motion: Motion | None) -> Float64Array:
-        """Return the motion (3,) from the middle of the lidar's revolution, where the scan is aligned, to its stamp."""
-        since = self._tracker.stamp_ns
-        if motion is None or not motion.is_known or since is None or stamp_ns <= since:
+    def _within_revolution(self, scan: Scan, motion: Motion | None) -> Float64Array:
+        """Return the motion (3,) from the middle of the lidar's revolution, where the scan is aligned, to its stamp.
+
+        Zero where the points are at the moment of the stamp already.
+        """
+        since, stamp_ns = self._tracker.stamp_ns, scan.stamp_ns
+        if scan.is_at_stamp or motion is None or not motion.is_known or since is None or stamp_ns <= since:
             return np.zeros(3)
         seconds = (self.config.scan.stamped_at - 0.5) * self.config.scan.period_s
         return np.asarray(motion.delta * (seconds / ((stamp_ns - since) * 1e-9)))

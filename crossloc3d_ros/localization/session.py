@@ -19,6 +19,8 @@ from crossloc3d_ros.localization.estimates import no_estimate
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
 from crossloc3d_ros.localization.fusion.priors import PosePrior
+from crossloc3d_ros.localization.motion_compensation import MotionCompensation, SteadyMotion
+from crossloc3d_ros.localization.scan_checks import ScanChecks
 from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
 
 OdometryKind = Literal["topic", "scan", "none"]
@@ -36,6 +38,8 @@ class Outcome:
     estimate: Estimate
     is_fault: bool = False
     """The scan could not be used: it could not be read, or localizing it failed. The estimate has no fix."""
+    within_turn: str = ""
+    """What was done with the motion within a turn, and why not more; empty where the scan did not get that far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,8 @@ class PreparedInput:
     """(3,) unit vector that points up, base frame; None where it is not known."""
     heading: PosePrior | None
     """The newest heading of a compass; None where there is none."""
+    fault: str = ""
+    """Why the scan cannot be used already: what is wrong with the lidar by it; or empty."""
 
 
 class ScanLocalizer(Protocol):
@@ -95,6 +101,8 @@ class Session:
         self._priors: list[PosePrior] = []
         self._odometry = OdometryBuffer(config.fusion) if odometry == "topic" else None
         self._scan_odometry = ScanOdometry(config.fusion, config.scan.max_range_m) if odometry == "scan" else None
+        self._compensation = MotionCompensation(config)
+        self._checks = ScanChecks(config.scan)
 
     def reset(self) -> None:
         """Forget the hypotheses, the priors and what the IMU measured: the robot may be anywhere, in any attitude."""
@@ -110,6 +118,7 @@ class Session:
         """Use other settings from the next scan on; hypotheses, priors and the odometry received so far are kept."""
         mounting = self.localizer.config.scan.mounting
         self.localizer.reconfigure(config)
+        self._compensation.reconfigure(config)
         if self._odometry is not None:
             self._odometry.reconfigure(config.fusion)
         if self._scan_odometry is not None:
@@ -157,11 +166,18 @@ class Session:
         """
         config = self.localizer.config.scan
         mounting = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
+        up = self._gravity.up(scan.stamp_ns) if up_base is None else up_base
+        by_topic = None if self._odometry is None else self._odometry.motion
+        fault = self._checks.fault(scan, mounting, config, by_topic)
+        if fault:
+            return PreparedInput(scan, mounting, up, self._heading, fault)
+        if self._odometry is None:  # from a topic, the motion of this turn may arrive later
+            steady = None if self._scan_odometry is None else SteadyMotion(self._scan_odometry)
+            scan = self._compensation(scan, mounting, steady)
         if self._scan_odometry is not None:
             ranges = np.linalg.norm(scan.points, axis=1)
             used = (ranges >= config.min_range_m) & (ranges <= config.max_range_m)  # and so finite
             self._scan_odometry.add(scan.stamp_ns, transform_points(mounting, scan.points[used]).astype(np.float64))
-        up = self._gravity.up(scan.stamp_ns) if up_base is None else up_base
         return PreparedInput(scan, mounting, up, self._heading)
 
     def localize(self, received: PreparedInput, wait_for_odometry: Callable[[int], None] | None = None) -> Outcome:
@@ -170,16 +186,21 @@ class Session:
         `wait_for_odometry(stamp_ns)` is called when the motion is needed and the odometry of that stamp is missing.
         """
         scan, localizer = received.scan, self.localizer
+        if received.fault:
+            return self.fault(scan.stamp_ns, received.fault)
 
         def motion() -> Motion | None:
             source = self._scan_odometry if self._odometry is None else self._odometry
             if source is None or localizer.stamp_ns is None:
                 return None
-            if wait_for_odometry is not None and not self.has_odometry_until(scan.stamp_ns):
-                wait_for_odometry(scan.stamp_ns)
+            self._await_odometry(scan.stamp_ns, wait_for_odometry)
             return source.motion(localizer.stamp_ns, scan.stamp_ns)
 
         try:
+            if self._odometry is not None:
+                if self._compensation.needs_motion(scan):
+                    self._await_odometry(scan.stamp_ns, wait_for_odometry)
+                scan = self._compensation(scan, received.T_base_lidar, self._odometry)
             self._hand_over_priors(received)
             estimate = localizer.localize(scan, received.up_base, received.T_base_lidar, motion)
         except CrossLocError as error:
@@ -187,11 +208,15 @@ class Session:
         if not len(estimate.candidates):  # nothing was compared with the map: what was known before still holds
             estimate = replace(estimate, state=self.state)
         self.state = estimate.state
-        return Outcome(estimate)
+        return Outcome(estimate, within_turn=self._compensation.words)
 
     def fault(self, stamp_ns: int, reason: str) -> Outcome:
         """Return the outcome of a scan that says nothing: no fix, and the state that it was."""
         return Outcome(replace(no_estimate(stamp_ns, reason), state=self.state), is_fault=True)
+
+    def _await_odometry(self, stamp_ns: int, wait: Callable[[int], None] | None) -> None:
+        if wait is not None and not self.has_odometry_until(stamp_ns):
+            wait(stamp_ns)
 
     def _hand_over_priors(self, received: PreparedInput) -> None:
         stamp_ns = received.scan.stamp_ns

@@ -106,6 +106,7 @@ class _Feed:
         self._session = session
         self._source = odometry
         self._warned = False
+        self._within_turn = ""
 
     @property
     def registers_scans(self) -> bool:
@@ -142,7 +143,12 @@ class _Feed:
     def localize(self, waiting: _Waiting) -> Outcome:
         if isinstance(waiting.scan, CloudError):
             return self._session.fault(waiting.stamp_ns, str(waiting.scan))
-        return self._session.localize(waiting.scan)
+        outcome = self._session.localize(waiting.scan)
+        compensated = outcome.within_turn.partition(":")[0]
+        if compensated and compensated != self._within_turn:
+            self._within_turn = compensated
+            log.info("motion within a turn is %s", outcome.within_turn)
+        return outcome
 
 
 def _outcomes(

@@ -153,6 +153,8 @@ def snapshot_values(snapshot: Snapshot) -> dict[str, str]:
         estimate = snapshot.last.estimate
         timings, counts = estimate.timings, estimate.counts
         values["last reason"] = estimate.reason
+        if snapshot.last.within_turn:
+            values["motion within a turn"] = snapshot.last.within_turn
         values.update(state_values(estimate))
         values["last steps (ms)"] = (
             f"prepare {timings.prepare_ms:.1f}, encode {timings.encode_ms:.1f}, search {timings.search_ms:.1f}, "

@@ -39,6 +39,7 @@ class Localizing:
         self._log = log
         self._odom_frame_id = ""
         self._last_status: FixStatus | None = None
+        self._within_turn = ""
         self._is_closed = False
 
     def close(self) -> None:
@@ -100,8 +101,15 @@ class Localizing:
         self._odometry.wait(add)
 
     def _log_outcome(self, outcome: Outcome) -> None:
-        """Log every change between fix and no fix, and now and then why there is none."""
+        """Log every change between fix and no fix, and now and then why there is none.
+
+        Also whether the motion within a turn is compensated, when that changes.
+        """
         estimate = outcome.estimate
+        compensated = outcome.within_turn.partition(":")[0]
+        if compensated and compensated != self._within_turn:
+            self._within_turn = compensated
+            self._log.info(f"motion within a turn is {outcome.within_turn}")
         changed = estimate.status is not self._last_status
         self._last_status = estimate.status
         if estimate.status is FixStatus.FIX:

@@ -1,13 +1,14 @@
-"""A robot with a VLP-16 drives a route and records what a robot records.
+"""A robot with a lidar drives a route and records what a robot records.
 
 `drive(world, route, path)` writes a rosbag2 with
 
-    /velodyne_points     sensor_msgs/PointCloud2   10 Hz, as Velodyne's driver sends it, stamped at the end of the turn
+    /velodyne_points     sensor_msgs/PointCloud2   10 Hz, as Velodyne's driver sends it, stamped at the end of the turn;
+                                                   of other lidars as their drivers name, lay out and stamp it
     /gnss                sensor_msgs/NavSatFix     position of base_link with wandering errors, covariance, outages
     /odom                nav_msgs/Odometry         wheel odometry that drifts, odom -> base_link
     /imu                 sensor_msgs/Imu           turn rate, specific force and attitude, axes as base_link
-    /ground_truth/fix    sensor_msgs/NavSatFix     the true position of base_link at each scan
-    /ground_truth/odom   nav_msgs/Odometry         the true pose at each scan, in an ENU frame
+    /ground_truth/fix    sensor_msgs/NavSatFix     the true position of base_link at the stamp of each scan
+    /ground_truth/odom   nav_msgs/Odometry         the true pose then, in an ENU frame
 
 The altitude is NaN where the world's geoid is not known, as for heights above NAP.
 """
@@ -27,15 +28,24 @@ from scipy.spatial.transform import Rotation
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import MountingConfig, option
 from crossloc3d_ros.formats import bag, messages
+from crossloc3d_ros.formats.messages import CloudLayout
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.simulation.lidar import Lidar, LidarConfig, LidarProfile
 from crossloc3d_ros.simulation.route import Route, RouteError
 from crossloc3d_ros.simulation.traffic import Traffic, TrafficConfig
-from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
+from crossloc3d_ros.simulation.vlp16 import VLP16
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float64Array
 
 _GRAVITY_M_S2 = 9.81
 _START_NS = 1_700_000_000_000_000_000
+_TOPICS_AND_FRAMES: dict[CloudLayout, tuple[str, str]] = {
+    "velodyne": ("/velodyne_points", "velodyne"),
+    "ouster": ("/ouster/points", "os_lidar"),
+    "hesai": ("/lidar_points", "hesai_lidar"),
+    "livox": ("/livox/lidar", "livox_frame"),
+}
+"""What the drivers call their clouds and the lidar's frame."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,7 @@ class DriveConfig:
     imu_rate_hz: float = option(100.0, "messages a second", low=1.0, high=500.0)
     mounting: MountingConfig = field(default_factory=MountingConfig, metadata={"text": "pose of the lidar"})
     traffic: TrafficConfig = field(default_factory=TrafficConfig, metadata={"text": "what moves around the robot"})
-    sensor: Vlp16Config = field(default_factory=Vlp16Config, metadata={"text": "the lidar"})
+    sensor: LidarConfig = field(default_factory=LidarConfig, metadata={"text": "the lidar"})
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,7 @@ def drive(
     config: DriveConfig | None = None,
     *,
     seed: int = 0,
+    profile: LidarProfile = VLP16,
     storage: Literal["mcap", "sqlite3"] = "mcap",
     frame: MapFrame | None = None,
     start_ns: int = _START_NS,
@@ -88,14 +99,15 @@ def drive(
 ) -> DriveReport:
     """Drive the route through the world and write the recording to the new folder `path`.
 
-    `frame` is the ENU frame of `/ground_truth/odom`, by default at the world's origin; `progress` is called with
-    stage, done, total and unit. Raises BagError where the folder exists or cannot be written, RouteError where the
-    route is shorter than one turn of the sensor; an interrupted drive leaves no bag.
+    `profile` is the lidar, which `config.sensor` describes further. `frame` is the ENU frame of `/ground_truth/odom`,
+    by default at the world's origin; `progress` is called with stage, done, total and unit. Raises BagError where the
+    folder exists or cannot be written, RouteError where the route is shorter than one turn of the sensor; an
+    interrupted drive leaves no bag.
     """
     config = config or DriveConfig()
     if route.duration_s <= 1.0 / config.sensor.rate_hz:
         raise RouteError(f"the route lasts {route.duration_s:.2f} s, less than one turn of the lidar")
-    robot = _Robot(world, route, config, frame, start_ns)
+    robot = _Robot(world, route, config, profile, frame, start_ns)
     streams = [
         robot.scans(seed, progress),
         robot.gnss(np.random.default_rng([seed, 2])),
@@ -108,7 +120,7 @@ def drive(
             writer.add_topic(topic, msgtype, qos)
         for event in _merged(streams):
             writer.write(event.topic, event.msgtype, event.stamp_ns, event.message)
-            if event.topic == "/velodyne_points":
+            if event.topic == robot.cloud_topic:
                 scans += 1
                 points += int(event.message.width)  # type: ignore[attr-defined]
     return DriveReport(scans, points, route.duration_s, route.length_m)
@@ -122,17 +134,25 @@ def _merged(streams: list[Iterator[_Event]]) -> Iterator[_Event]:
 class _Robot:
     """The drive as streams of messages, each in the order of its stamps."""
 
-    def __init__(self, world: World, route: Route, config: DriveConfig, frame: MapFrame | None, start_ns: int) -> None:
-        self.world, self.route, self.config, self.start_ns = world, route, config, start_ns
+    def __init__(
+        self,
+        world: World,
+        route: Route,
+        config: DriveConfig,
+        profile: LidarProfile,
+        frame: MapFrame | None,
+        start_ns: int,
+    ) -> None:
+        self.world, self.route, self.config, self.profile, self.start_ns = world, route, config, profile, start_ns
+        self.cloud_topic, self.lidar_frame_id = _TOPICS_AND_FRAMES[profile.layout]
         self.frame = frame or MapFrame(world.crs, world.origin_grid, world.geoid_separation_m)
         self.truth_frame_id = "map" if frame is not None else "world"
 
-    @staticmethod
-    def topics() -> list[tuple[str, str, bag.OfferedQos]]:
+    def topics(self) -> list[tuple[str, str, bag.OfferedQos]]:
         sensor = bag.OfferedQos(reliability="best_effort", durability="volatile", depth=5)
         reliable = bag.OfferedQos(reliability="reliable", durability="volatile", depth=10)
         return [
-            ("/velodyne_points", "sensor_msgs/msg/PointCloud2", sensor),
+            (self.cloud_topic, "sensor_msgs/msg/PointCloud2", sensor),
             ("/gnss", "sensor_msgs/msg/NavSatFix", sensor),
             ("/odom", "nav_msgs/msg/Odometry", reliable),
             ("/imu", "sensor_msgs/msg/Imu", sensor),
@@ -152,13 +172,12 @@ class _Robot:
     def scans(self, seed: int, progress: Callable[[str, float, float, str], None] | None) -> Iterator[_Event]:
         config = self.config
         rng = np.random.default_rng([seed, 1])
-        sensor = Vlp16(config.sensor)
+        sensor = Lidar(self.profile, config.sensor)
         T_base_lidar = mounting_matrix(config.mounting)
         period = 1.0 / config.sensor.rate_hz
         times = np.arange(period, self.route.duration_s, period)[:: config.scan_every]
         poses, twists = self.route.at(times), self.route.twist(times)
-        positions, quaternions = self.enu(poses)
-        latitudes, longitudes, altitudes = self.frame.to_geographic(self.world.to_grid(poses[:, :3, 3]))
+        until_end_s = period * (1.0 - self.profile.stamped_at)
         R = T_base_lidar[:3, :3]
         # A stream of its own: with more or less traffic all else stays the same.
         traffic = Traffic.draw(self.world, self.route, np.random.default_rng([seed, 5]), config.traffic)
@@ -168,16 +187,27 @@ class _Robot:
             twist = np.concatenate([R.T @ velocity, R.T @ turn_rate])
             movers = traffic.at(float(time), poses[i, :2, 3])
             scan = sensor.scan(self.world.scene, poses[i] @ T_base_lidar, rng, twist, movers)
-            stamp = self.stamp(time)
-            cloud = messages.velodyne_cloud(stamp, "velodyne", scan.points, scan.intensity, scan.ring, scan.time)
-            yield _Event(stamp, 0, "/velodyne_points", "sensor_msgs/msg/PointCloud2", cloud)
-            fix = messages.nav_sat_fix(stamp, "base_link", latitudes[i], longitudes[i], altitudes[i], np.zeros((3, 3)))
-            yield _Event(stamp, 1, "/ground_truth/fix", "sensor_msgs/msg/NavSatFix", fix)
-            odometry = messages.odometry(stamp, self.truth_frame_id, "base_link", positions[i], quaternions[i],
-                                    twists[i, :3], twists[i, 3:])  # fmt: skip
-            yield _Event(stamp, 2, "/ground_truth/odom", "nav_msgs/msg/Odometry", odometry)
+            sent = self.stamp(time)  # when the turn ends, whatever moment of it the stamp gives
+            cloud = messages.lidar_cloud(
+                self.profile.layout, self.stamp(time - until_end_s), self.lidar_frame_id,
+                scan.points, scan.intensity, scan.ring, scan.time.astype(np.float64) + until_end_s,
+            )  # fmt: skip
+            yield _Event(sent, 0, self.cloud_topic, "sensor_msgs/msg/PointCloud2", cloud)
+            yield from self.truth(time - until_end_s, sent)
             if progress is not None:
                 progress("driving", i + 1, len(times), "scans")
+
+    def truth(self, time_s: float, sent_ns: int) -> Iterator[_Event]:
+        """Yield the true pose at a time."""
+        pose, twist, stamp = self.route.at(time_s), self.route.twist(time_s)[0], self.stamp(time_s)
+        position, quaternion = self.enu(pose)
+        latitude, longitude, altitude = self.frame.to_geographic(self.world.to_grid(pose[:, :3, 3]))
+        fix = messages.nav_sat_fix(stamp, "base_link", latitude[0], longitude[0], altitude[0], np.zeros((3, 3)))
+        yield _Event(sent_ns, 1, "/ground_truth/fix", "sensor_msgs/msg/NavSatFix", fix)
+        odometry = messages.odometry(
+            stamp, self.truth_frame_id, "base_link", position[0], quaternion[0], twist[:3], twist[3:]
+        )
+        yield _Event(sent_ns, 2, "/ground_truth/odom", "nav_msgs/msg/Odometry", odometry)
 
     def gnss(self, rng: np.random.Generator) -> Iterator[_Event]:
         config = self.config

@@ -34,6 +34,7 @@ from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import Localizer, no_estimate
+from crossloc3d_ros.localization.session import Session
 from crossloc3d_ros.simulation.route import plan_route
 from crossloc3d_ros.simulation.vlp16 import Vlp16
 from crossloc3d_ros.types import BoolArray, Estimate, FixStatus, Float32Array, Float64Array, Scan, TrackState
@@ -348,6 +349,49 @@ def test_scans_upside_down_from_the_start(ride: Ride) -> None:
     says(told, "no pose fits the scans well")
     assert {t.estimate.state for t in told} == {TrackState.SEARCHING}
     found(robot, robot.ahead(20))
+
+
+# The lidar, by its scans alone: the session looks at each before it is localized
+
+
+def covered(points: Float32Array) -> Float32Array:
+    ranges = np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(points * (0.9 + 0.02 * (ranges % 50.0)) / ranges, dtype=np.float32)
+
+
+def on_its_side(points: Float32Array) -> Float32Array:
+    """As of a lidar that looks down where it is taken to look ahead: the ground ahead of it."""
+    return np.ascontiguousarray(points[:, [2, 1, 0]] * np.float32([-1.0, 1.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (upside_down, "the lidar is upside down: the ground lies above it"),
+        (on_its_side, "turned by 90 degrees in pitch: the ground stands upright ahead of it"),
+        (covered, "the lidar is covered or blocked"),
+        (None, "the lidar is frozen: it has repeated one scan"),
+    ],
+)
+def test_what_is_wrong_with_the_lidar_is_named(ride: Ride, change: Change | None, words: str) -> None:
+    """It is localized, then drives on with the fault, then all is well again."""
+    first, last = 20, 32
+    robot = Robot(ride)
+    session = Session(robot.localizer, "topic")
+    robot.odometry.add = session.add_odometry  # type: ignore[method-assign]
+    told: list[Told] = []
+    for place in range(len(ride)):
+        T_grid_base, points = robot._go(place, None, None, True), ride.scans[place]
+        if first <= place < last:
+            points = ride.scans[first - 1] if change is None else change(points)
+        received = session.receive(Scan(points, robot.clock_ns, "velodyne"), ride.T_base_lidar)
+        estimate = session.localize(received).estimate
+        told.append(Told(estimate, float(np.hypot(*(estimate.grid - T_grid_base[:3, 3])[:2]))))
+    assert told[first - 1].is_fix, said(told)
+    no_fix(told[first:last])
+    says(told[first:last], words)
+    no_fix_is_wrong(told)
+    assert told[-1].is_fix, said(told)
 
 
 # Time

@@ -15,7 +15,7 @@ from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import no_estimate
 from crossloc3d_ros.localization.session import Session
-from crossloc3d_ros.types import Candidates, Estimate, Float64Array, Scan, TrackState
+from crossloc3d_ros.types import Candidates, Estimate, FixStatus, Float64Array, PointTimes, Scan, TrackState
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -35,6 +35,7 @@ class Listener:
         self.finds_candidates = True
         self.during: Callable[[], None] = lambda: None
         self.ranges: list[float] = []
+        self.scans: list[Scan] = []
 
     def localize(
         self,
@@ -48,6 +49,7 @@ class Listener:
         self.motions.append(motion() if callable(motion) else motion)
         self.ups.append(gravity_base)
         self.mountings.append(T_base_lidar)
+        self.scans.append(scan)
         self.during()
         self.ranges.append(self.config.scan.max_range_m)
         self.stamp_ns = scan.stamp_ns
@@ -82,7 +84,9 @@ def room(x_m: float = 0.0, near: bool = False) -> np.ndarray:
 
 
 def scan_at(number: int, points: np.ndarray | None = None) -> Scan:
-    return Scan(room() if points is None else points, START_NS + number * STEP_NS, "velodyne")
+    seen = room() if points is None else points
+    # A lidar that repeats a scan bit for bit is frozen.
+    return Scan(seen + np.float32(1e-5 * number), START_NS + number * STEP_NS, "velodyne")
 
 
 def pose(x_m: float) -> np.ndarray:
@@ -246,3 +250,50 @@ def test_gravity_is_that_of_the_scans_time_or_the_one_that_is_given() -> None:
     session.reset()
     localize(session, scan_at(0))
     assert listener.ups[3] is None
+
+
+def ground(upside_down: bool) -> np.ndarray:
+    """Points (N, 3) of a level square, seen from 1.2 m above it."""
+    rng = np.random.default_rng(7)
+    points = np.column_stack([rng.uniform(-24, 24, (20_000, 2)), rng.normal(-1.2, 0.01, 20_000)])
+    return (points * (1, -1, -1 if upside_down else 1)).astype(np.float32)
+
+
+def test_what_is_wrong_with_the_lidar_is_a_fault_that_never_reaches_the_localizer() -> None:
+    listener = Listener()
+    session = Session(listener, "topic")
+    for i in range(30):
+        session.add_odometry(START_NS + i * STEP_NS, pose(0.2 * i))
+    good = localize(session, scan_at(0, ground(False)))
+    assert not good.is_fault
+    outcomes = [localize(session, scan_at(i, ground(True))) for i in (1, 2)]
+    frozen = [localize(session, Scan(ground(False), START_NS + i * STEP_NS, "velodyne")) for i in (3, 4, 5)]
+    for outcome, words in ((outcomes[0], "upside down"), (outcomes[1], "upside down"), (frozen[1], "frozen")):
+        assert outcome.is_fault
+        assert words in outcome.estimate.reason
+        assert outcome.estimate.status is FixStatus.NO_FIX
+        assert outcome.estimate.state is good.estimate.state, "what was known before still holds"
+    assert listener.stamp_ns == START_NS + 3 * STEP_NS, "the first of the repeated scans is a scan"
+    localize(session, scan_at(6, ground(False)))
+    assert listener.stamp_ns == START_NS + 6 * STEP_NS
+
+
+def test_a_scan_with_times_waits_for_the_motion_of_its_turn_and_comes_at_the_moment_of_its_stamp() -> None:
+    listener = Listener()
+    session = Session(listener, "topic")
+    for i in range(-2, 1):
+        session.add_odometry(START_NS + i * STEP_NS, pose(0.2 * i))
+    times = PointTimes("time", np.linspace(-0.1, 0.0, len(room()), dtype=np.float32))
+
+    def wait(stamp_ns: int) -> None:
+        session.add_odometry(stamp_ns, pose(0.2))
+
+    outcome = localize(session, dataclasses.replace(scan_at(1), times=times), wait_for_odometry=wait)
+    assert outcome.within_turn == "compensated: field 'time' in s from the stamp"
+    assert listener.scans[0].is_at_stamp
+    moved = listener.scans[0].points - scan_at(1).points
+    # The robot drives ahead: what it saw first is nearer by then.
+    np.testing.assert_allclose(moved[:, 0], 2.0 * times.values, atol=1e-4)
+    without = localize(session, scan_at(2))
+    assert without.within_turn == "not compensated: the cloud carries no time per point"
+    assert not listener.scans[1].is_at_stamp

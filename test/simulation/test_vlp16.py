@@ -10,10 +10,11 @@ import pytest
 
 from crossloc3d_ros.formats.bag import open_bag
 from crossloc3d_ros.simulation import mesh
+from crossloc3d_ros.simulation.lidar import LidarConfig
 from crossloc3d_ros.simulation.scene import Label, Scene
-from crossloc3d_ros.simulation.vlp16 import Vlp16, Vlp16Config
+from crossloc3d_ros.simulation.vlp16 import Vlp16
 
-CLEAN = Vlp16Config(range_error_m=0.0, echo_limit=0.0, random_dropout=0.0, body=())
+CLEAN = LidarConfig(range_error_m=0.0, echo_limit=0.0, random_dropout=0.0, body=())
 
 
 def plain(half_m: float = 300.0) -> Scene:
@@ -61,7 +62,7 @@ def test_a_turn_has_the_sensors_angles_times_and_firing_order() -> None:
 
 
 def test_ranges_are_as_noisy_as_asked() -> None:
-    config = Vlp16Config(range_error_m=0.02, echo_limit=0.0, random_dropout=0.0, body=())
+    config = LidarConfig(range_error_m=0.02, echo_limit=0.0, random_dropout=0.0, body=())
     clean = Vlp16(CLEAN).scan(room(), lidar_at(0.0), np.random.default_rng(5))
     noisy = Vlp16(config).scan(room(), lidar_at(0.0), np.random.default_rng(5))
     difference = np.linalg.norm(noisy.points, axis=1) - np.linalg.norm(clean.points, axis=1)
@@ -70,7 +71,7 @@ def test_ranges_are_as_noisy_as_asked() -> None:
 
 
 def test_echoes_end_with_range_and_grazing_incidence() -> None:
-    config = Vlp16Config(body=())
+    config = LidarConfig(body=())
     scan = Vlp16(config).scan(plain(), lidar_at(1.2), np.random.default_rng(0))
     per_ring = np.bincount(scan.ring, minlength=16)
     assert (per_ring[:6] > 1500).all()  # down to 13 m all comes back
@@ -83,7 +84,7 @@ def test_echoes_end_with_range_and_grazing_incidence() -> None:
 
 def test_the_own_body_hides_what_lies_behind() -> None:
     mast = (-0.6, -0.1, -1.0, -0.5, 0.1, 1.0)
-    scan = Vlp16(Vlp16Config(body=mast, random_dropout=0.0)).scan(room(), lidar_at(0.0), np.random.default_rng(0))
+    scan = Vlp16(LidarConfig(body=mast, random_dropout=0.0)).scan(room(), lidar_at(0.0), np.random.default_rng(0))
     distance = np.linalg.norm(scan.points, axis=1)
     behind = np.abs(np.abs(np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))) - 180.0) < 8.0
     assert behind.sum() > 500
@@ -116,7 +117,7 @@ def test_motion_distorts_as_the_twist_says() -> None:
 
 def test_water_sends_nothing_back() -> None:
     lake = mesh.scene_from([mesh.height_grid(np.zeros((2, 2)), -300, -300, 600, Label.WATER)])
-    assert len(Vlp16(Vlp16Config(body=())).scan(lake, lidar_at(1.2), np.random.default_rng(0)).points) == 0
+    assert len(Vlp16(LidarConfig(body=())).scan(lake, lidar_at(1.2), np.random.default_rng(0)).points) == 0
 
 
 def test_a_scan_looks_like_a_real_one(shared: Any) -> None:
