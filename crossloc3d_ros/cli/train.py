@@ -90,7 +90,12 @@ def _parser() -> argparse.ArgumentParser:
         default=Path("out/benchmark"),
         help="folder in which pose sets are kept (default: %(default)s)",
     )
-    alignment.add_argument("--weights", type=Path, help="weights of the set's map (default: the shipped ones)")
+    alignment.add_argument(
+        "--surveys", type=Path, nargs="+", metavar="LAZ",
+        help="real surveys to learn from beside the simulated towns: files, folders, globs",
+    )  # fmt: skip
+    alignment.add_argument("--weights", type=Path, help="weights of the sets' maps (default: the shipped ones)")
+    alignment.add_argument("--workers", type=int, default=1, help="processes that make the sets (default: 1)")
     alignment.add_argument("--output", type=Path, required=True, help="file to write (.safetensors)")
     alignment.set_defaults(action=_alignment)
 
@@ -123,20 +128,26 @@ def _parser() -> argparse.ArgumentParser:
 def _alignment(arguments: argparse.Namespace) -> int:
     import functools
 
-    from crossloc3d_ros.datasets.pose_sets import open_pose_set
+    from crossloc3d_ros.datasets.belief_sets import BeliefRequest, open_belief_sets
     from crossloc3d_ros.encoder.checkpoint import load_encoder
+    from crossloc3d_ros.formats.las import expand_inputs
+    from crossloc3d_ros.localization.alignment.observation_model import MEASURES
     from crossloc3d_ros.training.alignment import fit_alignment
+    from crossloc3d_ros.training.learning_sets import learning_sets
 
     target = common.console()
     with common.ProgressDisplay(target) as display:
         loader = functools.partial(load_encoder, arguments.weights, "cpu", 1)
-        pose_set = open_pose_set("fitting", arguments.data, loader, progress=display)
-        model, answers = fit_alignment(pose_set, progress=display)
+        surveys = tuple(expand_inputs(arguments.surveys)) if arguments.surveys else ()
+        request = BeliefRequest(("fitting",), arguments.data, learned=surveys)
+        sets = open_belief_sets(request, loader, workers=arguments.workers, progress=display)
+        model, measured = fit_alignment(learning_sets(sets), progress=display)
     model.save(arguments.output)
-    found = sum(answer.right == 0 for answer in answers)
+    found = sum(poses.right == 0 for poses in measured)
+    weights = ", ".join(f"{name} {weight:.2f}" for name, weight in zip(MEASURES, model.weights, strict=False))
     target.print(
-        f"{arguments.output}: {len(answers)} scans, {found} of them right at once; as likely here as not at "
-        f"{model.expected_share:.2f} of the expected score, odds times e for {model.temperature:.1f}"
+        f"{arguments.output}: {len(measured)} scans on {len({poses.set_name for poses in measured})} maps, {found} of "
+        f"them right at once; weights: {weights}, constant {model.weights[-1]:.2f}"
     )
     return 0
 

@@ -59,7 +59,7 @@ _TOWN_SURVEY = "town.laz"
 _OTHER_DRIVE, _LONGER = 500_000, 4.0 / 3.0
 """Added to the seed of a drive and times its length, for drives through aged towns; no other drive has such a seed."""
 _APART_DEG = 0.002
-"""A drive that is some 200 m away from a map sees nothing of it."""
+"""A robot that is some 200 m away from a map sees nothing of it."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,12 @@ def open_belief_sets(
     return BeliefSets(tuple(on_map), tuple(maps))
 
 
-def are_apart(aerial_map: AerialMap, frame_map: AerialMap, drive: RawDrive) -> bool:
-    """Return whether a drive, whose poses lie in the grid of `frame_map`, keeps off another map altogether."""
+def are_apart(aerial_map: AerialMap, frame_map: AerialMap, T_grid_base: Float64Array) -> bool:
+    """Return whether poses (S, 4, 4), which lie in the grid of `frame_map`, keep off another map altogether."""
     west, south, east, north = aerial_map.bounds
     corners = np.array([[e, n, 0.0] for e in (west, east) for n in (south, north)])
     low, high = _geographic_box(aerial_map, corners)
-    first, last = _geographic_box(frame_map, drive.scans.T_grid_base[:, :3, 3])
+    first, last = _geographic_box(frame_map, T_grid_base[:, :3, 3])
     return bool(((first > high + _APART_DEG) | (last < low - _APART_DEG)).any())
 
 

@@ -1,5 +1,8 @@
 """A real survey divided into two halves without a point in common: one is mapped, the other is driven through.
 
+A sparse survey is driven through as a whole. Ground that has no class is found by the filter of the map builder; the
+map is built of the points as they were delivered.
+
 The echoes are as many surveys of one day: what the map holds of a wall, another pulse has hit. It says how well a
 place is known in real geometry of any country; changes between two epochs it doesn't show.
 """
@@ -22,7 +25,7 @@ from crossloc3d_ros.datasets.pose_sets import ALL, PoseSet, load_pose_set, to_gr
 from crossloc3d_ros.datasets.raw_scans import RawScans, save_scans
 from crossloc3d_ros.datasets.set_maps import Progress, make_map
 from crossloc3d_ros.datasets.simulated import SimulatedBenchmark, raw_scans, sources_digest
-from crossloc3d_ros.datasets.survey_parts import density_per_m2, write_part
+from crossloc3d_ros.datasets.survey_parts import classify_part, density_per_m2, write_part
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.simulation import mesh, real_world, vlp16, world
 from crossloc3d_ros.simulation.real_world import world_from_survey
@@ -31,9 +34,11 @@ from crossloc3d_ros.workers import EncoderLoader
 
 _log = logging.getLogger(__name__)
 
-VERSION = 1
-LEAST_PER_M2 = 5.0
-"""A sparser survey has no half that shows roofs and kerbs: a world made of it is not what a robot would see."""
+VERSION = 2
+LEAST_PER_M2 = 1.5
+"""A world made of a sparser survey is not what a robot would see."""
+DIVIDED_PER_M2 = 5.0
+"""Half of a sparser survey shows neither roofs nor kerbs: it is driven through as a whole, and half of it is mapped."""
 _SCANS, _DRIVES, _DRIVE_M = 200, 3, 200.0
 _BORDER_M = 25.0
 """How far inside of the survey robots stay: half the reach of a submap, so that the map shows where they are."""
@@ -45,7 +50,7 @@ _SPEED_M_S, _EVERY = 2.5, 5
 def open_halves(path: Path, data: Path, loader: EncoderLoader, *, progress: Progress | None = None) -> PoseSet | None:
     """Return scans and drives in one half of a survey's points, with the map of the other half.
 
-    None, with a warning, where no robot can drive through the survey: it is too sparse, has no class of ground, or no
+    None, with a warning, where no robot can drive through the survey: it is too sparse, or has no
     free ground. Kept in `data/halves-NAME-HASH`. Raises EvaluationError for what cannot be written.
     """
     report = progress or (lambda stage, done, total, unit: None)
@@ -73,7 +78,7 @@ def _settings_of(path: Path) -> dict[str, Any]:
             "format": store.FORMAT_VERSION,
             "survey": sha256(path),
             "plans": [settings_of_plan(plan) for plan in _plans(path)],
-            "scans": [_SCANS, LEAST_PER_M2],
+            "scans": [_SCANS, LEAST_PER_M2, DIVIDED_PER_M2],
             "simulator": sources_digest(real_world, mesh, world, vlp16),
         }
     )
@@ -97,7 +102,8 @@ def _make(folder: Path, path: Path, settings: dict[str, Any], report: Progress) 
         raise _NoWorldError(f"{density:.1f} points/m2 are too few to be divided (at least {LEAST_PER_M2:g})")
     with whole(folder / "parts") as partial:
         write_part([path], partial / _MAP_HALF, 0.0, 0.5)
-        write_part([path], partial / _DRIVEN_HALF, 0.5, 1.0)
+        write_part([path], partial / _DRIVEN_HALF, 0.5 if density >= DIVIDED_PER_M2 else 0.0, 1.0)
+        classify_part(partial / _DRIVEN_HALF)
     try:
         town = world_from_survey([folder / "parts" / _DRIVEN_HALF], seed=_seed(path), progress=report)
         for i, plan in enumerate(_plans(path)):

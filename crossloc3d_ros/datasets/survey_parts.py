@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from crossloc3d_ros.aerial_map.survey import read_survey
+from crossloc3d_ros.clouds.survey_ground import classify_ground
 from crossloc3d_ros.errors import EvaluationError
-from crossloc3d_ros.formats.las import LazWriter, iter_chunks
+from crossloc3d_ros.formats.las import GROUND, LazWriter, iter_chunks
 from crossloc3d_ros.geodesy import Projection, parse_crs
 from crossloc3d_ros.types import Float64Array
 
 _MILLIMETRE, _DEGREE_STEP = 0.001, 1e-8
 """Steps of the coordinates written: finer than those of the surveys, so that none is moved."""
+UNCLASSIFIED = 1
+"""ASPRS class of points that are not ground, as far as a filter knows."""
 _CELL_M = 5.0
 """Cells in which the area that a survey covers is counted: a gap of a roof's shadow is none, a missing tile is one."""
 _MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
@@ -56,6 +59,22 @@ def write_part(inputs: Sequence[Path], target: Path, low: float, high: float) ->
         if kept == 0:
             raise EvaluationError(f"none of the {survey.points:,} points of {inputs[0]} is left: ask for more of them")
     return kept
+
+
+def classify_part(path: Path) -> None:
+    """Give a LAZ file's ground points their class, by the filter of the map builder, where none has it.
+
+    Nothing is done to a file that holds points of class 2. Heights and plane coordinates must be in metres.
+    """
+    survey = read_survey([path])
+    chunks = list(iter_chunks(path))
+    points = np.concatenate([chunk.points for chunk in chunks])
+    classes = np.concatenate([chunk.classification for chunk in chunks])
+    if (classes == GROUND).any():
+        return
+    classes = np.where(classify_ground(points), GROUND, UNCLASSIFIED).astype(np.uint8)
+    with LazWriter(path, survey.crs, scale=_MILLIMETRE, offset=np.floor(survey.minimum)) as writer:
+        writer.write(points, classes)
 
 
 def density_per_m2(inputs: Sequence[Path]) -> float:

@@ -28,6 +28,7 @@ from crossloc3d_ros.types import (
     Scan,
     TrackState,
     no_aligned_poses,
+    no_candidates,
 )
 
 __all__ = ["Localizer", "no_estimate"]
@@ -66,6 +67,9 @@ class Localizer:
     ) -> Estimate:
         """Return where `scan` was taken.
 
+        A scan of too few points for a descriptor is aligned all the same, at the hypotheses and on the whole map, if
+        it has evidence enough (`alignment.min_cells`).
+
         `gravity_base` (3,) is the unit vector that points up, measured in the base frame, where an IMU gives one;
         `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it. `motion` leads from the
         last scan that counted (`stamp_ns` of this object) to this one; None = not known. A function is called for it
@@ -76,11 +80,13 @@ class Localizer:
             T_base_lidar = mounting_matrix(self.config.scan.mounting)
         prepared = prepare_scan(scan, self.config.scan, self.encoder.preprocessing, gravity_base, T_base_lidar)
         watch.lap("prepare_ms")
-        if prepared.patch is None:
+        found = no_candidates()
+        if prepared.patch is not None:
+            descriptors = encode_query(self.encoder, prepared.patch.points)
+            watch.lap("encode_ms")
+            found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
+        elif self._aligner is None or not self._aligner.has_evidence(prepared):
             return no_estimate(scan.stamp_ns, prepared.reason, prepared.counts, watch.timings)
-        descriptors = encode_query(self.encoder, prepared.patch.points)
-        watch.lap("encode_ms")
-        found = retrieve(descriptors, self.aerial_map, self._candidates_sought, self.calibration)
         candidates, frame = _first(found, self.config.top_k), self.aerial_map.frame
         place = decide(candidates, frame.to_enu(candidates.grid), self.config.retrieval)
         watch.lap("search_ms")

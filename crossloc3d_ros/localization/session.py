@@ -6,6 +6,7 @@ same estimates in all three. It has no threads and no locks: whoever owns it fee
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
@@ -205,7 +206,8 @@ class Session:
             estimate = localizer.localize(scan, received.up_base, received.T_base_lidar, motion)
         except CrossLocError as error:
             return self.fault(scan.stamp_ns, str(error))
-        if not len(estimate.candidates):  # nothing was compared with the map: what was known before still holds
+        if not len(estimate.candidates) and math.isnan(estimate.probability):
+            # Nothing was compared with the map: what was known before still holds.
             estimate = replace(estimate, state=self.state)
         self.state = estimate.state
         return Outcome(estimate, within_turn=self._compensation.words)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -22,6 +21,7 @@ from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans
 from crossloc3d_ros.datasets.simulated import BenchmarkTown, SimulatedBenchmark
 from crossloc3d_ros.formats.las import write_laz
 from crossloc3d_ros.simulation.survey import SurveyConfig
+from crossloc3d_ros.types import Float64Array
 
 TOWN = SimulatedPoses(
     SimulatedBenchmark(
@@ -67,21 +67,19 @@ def test_a_scan_is_seen_as_the_condition_says() -> None:
     assert [len(each.points) for each in other.scans] == [200, 200]
 
 
-def test_only_drives_away_from_a_map_are_off_it(town_map: AerialMap) -> None:
+def test_only_poses_away_from_a_map_are_off_it(town_map: AerialMap) -> None:
     west, south, east, north = town_map.bounds
-    scan = RawScan(np.zeros((1, 3), np.float32), np.eye(4), np.eye(4))
 
-    def drive_at(easting: float, northing: float) -> RawDrive:
+    def pose_at(easting: float, northing: float) -> Float64Array:
         pose = np.eye(4)
         pose[:2, 3] = easting, northing
-        scans = RawScans.of([dataclasses.replace(scan, T_grid_base=pose)])
-        return RawDrive(PLANS[0], scans, np.zeros(0, np.int64), np.zeros((0, 3)))
+        return pose[None]
 
     middle = (west + east) / 2, (south + north) / 2
-    assert not are_apart(town_map, town_map, drive_at(*middle))
-    assert not are_apart(town_map, town_map, drive_at(east + 50.0, middle[1]))
-    assert are_apart(town_map, town_map, drive_at(east + 500.0, middle[1]))
-    assert are_apart(town_map, town_map, drive_at(middle[0], south - 500.0))
+    assert not are_apart(town_map, town_map, pose_at(*middle))
+    assert not are_apart(town_map, town_map, pose_at(east + 50.0, middle[1]))
+    assert are_apart(town_map, town_map, pose_at(east + 500.0, middle[1]))
+    assert are_apart(town_map, town_map, pose_at(middle[0], south - 500.0))
 
 
 @pytest.fixture

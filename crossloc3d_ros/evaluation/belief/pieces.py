@@ -134,7 +134,7 @@ def _off_map(sets: BeliefSets) -> list[Piece]:
     for each in [each for each in delivered if not each.is_learned] or delivered:
         for number, drive in enumerate(each.drives):
             for target in sets.maps:
-                if not are_apart(maps[target.folder], maps[each.pose_set.map_folder], drive):
+                if not are_apart(maps[target.folder], maps[each.pose_set.map_folder], drive.scans.T_grid_base):
                     continue
                 about = PieceAbout(
                     _file_name(f"on {target.name} off {each.name} drive {number:02d}"), False, target.name, each.name,

@@ -106,6 +106,10 @@ class Aligner:
         if self.searches_map:
             self.likelihood.prepare()
 
+    def has_evidence(self, prepared: PreparedScan) -> bool:
+        """Return whether a scan has evidence in enough cells to be aligned."""
+        return len(evidence_of(prepared.place, prepared.sensor_height_m)) >= self.config.min_cells
+
     def begin(
         self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Candidates
     ) -> Alignment | None:

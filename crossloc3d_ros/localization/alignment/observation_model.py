@@ -39,6 +39,7 @@ SUPPORT_BOUNDS = np.array([0.7, 0.95])
 metre. How low, how high and how closed a place appears depends on how many echoes there are to show it."""
 _SUPPORTS = len(SUPPORT_BOUNDS) + 1
 _SUPPORT_CELLS = 11  # side of the square that the share is taken of: a hundred cells, within one flight strip
+_GAP_CELLS = 5  # side of the widest gap that sparse echoes leave: at 0.3 a square metre one in two thousand is wider
 _GROUND_M = 1.0  # an echo so low above the terrain came from the ground
 _HOLE_M = 20  # half the width of the widest hole in a survey that is taken for water
 PATTERNS = _CLOSEDNESS * _STEPS**3
@@ -123,7 +124,7 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
     """Return the class (H, W) of each cell of 1 m from terrain, surface and lowest echoes (H, W).
 
     All in metres, NaN where unknown. A gap inside of the survey is as high as the mean of its eight neighbours with an
-    echo; where echoes are sparse, gaps are filled from as far as three cells away. What is left is a hole.
+    echo; where echoes are sparse, narrow gaps are filled from as far as three cells away. What is left is a hole.
     """
     above = surface - terrain
     known = np.isfinite(above)
@@ -131,9 +132,9 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
         return np.full(above.shape, UNKNOWN, np.int32)
     support = np.full(above.shape, _SUPPORTS - 1)
     if not known.all():
-        holes = _holes(known)
-        support = _support_levels(known, holes)
-        above = _filled(above, holes, support)
+        holes, covered = _holes(known), _covered(known)
+        support = _support_levels(known, covered)
+        above = _filled(above, holes, covered, support)
         known = np.isfinite(above)
         unseen = np.where(holes, HOLE, UNKNOWN)
     held = np.where(known, above, 0.0)
@@ -149,20 +150,30 @@ def surface_classes(terrain: Float32Array, surface: Float32Array, lowest: Float3
     return (classes if known.all() else np.where(known, classes, unseen)).astype(np.int32)
 
 
-def _support_levels(known: BoolArray, holes: BoolArray) -> Int64Array:
-    """Return the level (H, W) of the share of cells with an echo around each cell, among those of the survey."""
-    surveyed = ndimage.uniform_filter((known | holes).astype(np.float32), _SUPPORT_CELLS, mode="constant")
+def _covered(known: BoolArray) -> BoolArray:
+    """Mark the cells with an echo, and gaps between them that are narrower than `_GAP_CELLS`: not the wider water."""
+    square = np.ones((_GAP_CELLS, _GAP_CELLS), np.bool_)
+    return np.asarray(ndimage.binary_erosion(ndimage.binary_dilation(known, square), square, border_value=1))
+
+
+def _support_levels(known: BoolArray, covered: BoolArray) -> Int64Array:
+    """Return the level (H, W) of the share of cells with an echo around each cell, among those that are covered."""
+    area = ndimage.uniform_filter(covered.astype(np.float32), _SUPPORT_CELLS, mode="constant")
     share = ndimage.uniform_filter(known.astype(np.float32), _SUPPORT_CELLS, mode="constant")
-    return np.asarray(np.digitize(share / np.maximum(surveyed, 1e-6), SUPPORT_BOUNDS), np.int64)
+    return np.asarray(np.digitize(share / np.maximum(area, 1e-6) + 1e-6, SUPPORT_BOUNDS), np.int64)
 
 
-def _filled(above: Float32Array, holes: BoolArray, support: Int64Array) -> Float32Array:
-    """Return heights (H, W) with the gaps of the survey filled by the mean of their neighbours, from echo to echo."""
+def _filled(above: Float32Array, holes: BoolArray, covered: BoolArray, support: Int64Array) -> Float32Array:
+    """Return heights (H, W) with gaps of the survey filled by the mean of their neighbours.
+
+    Beside an echo always; where echoes are sparse, covered cells from two or three cells away too.
+    """
     for level in range(_SUPPORTS - 1, -1, -1):
         known = np.isfinite(above)
         weight = ndimage.uniform_filter(known.astype(np.float32), 3, mode="constant")
         total = ndimage.uniform_filter(np.where(known, above, 0.0), 3, mode="constant")
-        filled = ~known & holes & (weight > 0.05) & (support <= level)  # a ninth for each
+        gaps = holes if level == _SUPPORTS - 1 else covered & (support <= level)
+        filled = ~known & gaps & (weight > 0.05)  # a ninth for each
         above = np.where(known, above, np.where(filled, total / np.where(filled, weight, 1.0), np.nan))
     return above
 

@@ -72,10 +72,13 @@ def candidate_probabilities(distances: Float32Array, calibration: CalibrationCon
 def decide(candidates: Candidates, enu: Float64Array, config: RetrievalConfig) -> PlaceBelief:
     """Return the most probable place, and whether its probability is enough for a fix.
 
-    `enu` (k, 3) holds the candidates' positions in the map frame; k must be at least 1. The place is the group of
-    candidates within `cluster_radius_m` of one of them with the largest probability; its position is their weighted
-    mean, its covariance their weighted spread on top of the floor that the size of a submap sets.
+    `enu` (k, 3) holds the candidates' positions in the map frame. The place is the group of candidates within
+    `cluster_radius_m` of one of them with the largest probability; its position is their weighted mean, its covariance
+    their weighted spread on top of the floor that the size of a submap sets. Without candidates it is NaN.
     """
+    if not len(candidates):
+        nowhere = np.full(3, np.nan), np.full((3, 3), np.nan)
+        return PlaceBelief(FixStatus.NO_FIX, "there are no candidates", 0.0, *nowhere, np.empty(0, np.bool_))
     probabilities = candidates.probabilities
     members = _heaviest_group(enu, probabilities, config.cluster_radius_m)
     probability = float(probabilities[members].sum())
