@@ -228,6 +228,26 @@ def test_one_scan_is_enough_for_position_and_heading(town: tuple[PoseSet, Aerial
     assert believed >= 3
 
 
+def test_a_scan_of_too_few_points_for_a_descriptor_is_aligned(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    localizer, by_retrieval = in_town(town, scope="map"), in_town(town, scope="none")
+    fewest = localizer.encoder.preprocessing.min_points
+    right = few = 0
+    for scan in town[0].scans:
+        sparse = dataclasses.replace(scan, points=scan.points[::40])
+        if not town[0].on_map[scan.area] or not 0 < seen(by_retrieval, sparse).counts.in_patch < fewest:
+            continue
+        assert "are needed" in seen(by_retrieval, sparse).reason
+        localizer.reset()
+        estimate = seen(localizer, sparse)
+        few += 1
+        assert len(estimate.candidates) == 0 and len(estimate.aligned) > 0
+        right += is_right(sparse, estimate.aligned.grid[0], float(estimate.aligned.heading_rad[0]))
+        hopeless = dataclasses.replace(scan, points=scan.points[::4000])
+        assert "points left after filtering" in seen(localizer, hopeless).reason, "nothing that could be aligned"
+    assert few >= 3
+    assert right > few / 2
+
+
 @pytest.mark.parametrize("scope", ["candidates", "auto"])
 def test_a_robot_outside_of_the_map_gets_no_fix(town: tuple[PoseSet, AerialMap, Any], scope: Any) -> None:
     localizer = in_town(town, scope=scope)
