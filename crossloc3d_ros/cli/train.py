@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     curve.add_argument("--output", type=Path, help="file to write (default: progress.html in the run)")
     curve.set_defaults(action=_curve)
     alignment = commands.add_parser(
-        "alignment", help="fit the observation model of the alignment and the calibration of its scores"
+        "alignment", help="fit the observation model of the alignment and the weights of its local null hypothesis"
     )
     alignment.add_argument(
         "--data",

@@ -11,6 +11,7 @@ import numpy as np
 
 from crossloc3d_ros.datasets.pose_drives import Journey, RawDrive
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans
+from crossloc3d_ros.simulation.vlp16 import VLP16
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class Condition:
     """To how many points the survey of the map is thinned; None leaves it as it was delivered."""
     is_aged: bool = False
     """Whether trees and houses are gone from the world that is scanned; see `datasets.aged`."""
+    lidar: str = VLP16.name
+    """Of `simulation.profiles`: what scans and drives are recorded with."""
     every_point: int = 1
     """Each n-th point of a scan is kept, in the order in which the sensor sends them."""
     max_range_m: float = math.inf
@@ -32,7 +35,7 @@ class Condition:
     @property
     def is_recorded_anew(self) -> bool:
         """Whether scans and drives are others than those of the pose set."""
-        return self.is_aged
+        return self.is_aged or self.lidar != VLP16.name
 
     @property
     def changes_scans(self) -> bool:
@@ -70,7 +73,9 @@ CONDITIONS = (
     Condition("2 points/m2", density_per_m2=2.0),
     Condition("0.5 points/m2", density_per_m2=0.5),
     Condition("aged", is_aged=True),
+    Condition("64 beams", lidar="os1-64"),
     Condition("every 20th point", every_point=20),
     Condition("range 30 m", max_range_m=30.0),
 )
-"""Of the simulated towns. Densities of national surveys; a sensor of some 1,500 points; fog, rain or a short sensor."""
+"""Of the simulated towns. Densities of national surveys; a lidar that sends four times as many points as a VLP-16, in a
+wider field; a sensor of some 1,500 points; fog, rain or a short sensor."""

@@ -50,11 +50,15 @@ from crossloc3d_ros.datasets.pose_sets import (
 from crossloc3d_ros.datasets.raw_scans import save_scans
 from crossloc3d_ros.datasets.set_maps import Progress, make_map
 from crossloc3d_ros.datasets.survey_parts import density_per_m2, write_part
+from crossloc3d_ros.simulation.lidar import Lidar, LidarProfile
+from crossloc3d_ros.simulation.profiles import PROFILES
+from crossloc3d_ros.simulation.vlp16 import VLP16
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float64Array
 from crossloc3d_ros.workers import EncoderLoader
 
-VERSION = 1
+VERSION = 2
+"""Raised where maps or scans come out otherwise though no setting has changed, as by another ground filter."""
 _TOWN_SURVEY = "town.laz"
 _OTHER_DRIVE, _LONGER = 500_000, 4.0 / 3.0
 """Added to the seed of a drive and times its length, for drives through aged towns; no other drive has such a seed."""
@@ -184,6 +188,11 @@ class _Part:
     condition: Condition | None = None
     """Under which it is scanned; None: a thinner survey."""
 
+    @property
+    def lidar(self) -> LidarProfile:
+        """What it is scanned with."""
+        return PROFILES[(self.condition or DELIVERED).lidar]
+
 
 class _Conditions:
     """The conditions of one simulated set."""
@@ -232,14 +241,18 @@ class _Conditions:
     def _recorded(self, condition: Condition) -> PoseSet:
         """Return the set with scans and drives recorded under a condition, on the map as it was delivered."""
         folder = self._folder / condition.name
+        sensor = benchmark.plain({"lidar": dataclasses.asdict(PROFILES[condition.lidar])})
         parts, recordings = [], []
         plans = drive_plans(self._pose_set.name)
         for area, survey in enumerate(self._surveys):
             parts.append(
-                _Part(folder / survey.parent.name, self._settings, self._poses, area, survey, condition=condition)
-            )
+                _Part(
+                    folder / survey.parent.name, {**self._settings, **sensor}, self._poses, area, survey,
+                    condition=condition,
+                )
+            )  # fmt: skip
             plan = _elsewhere(next(each for each in plans if each.area == area))
-            settings = settings_of_plan(plan)
+            settings = {**settings_of_plan(plan), **sensor}
             recordings.append(
                 _Part(
                     folder / DRIVES / f"{area:02d}", settings, self._poses, area, survey, plan=plan, condition=condition
@@ -286,11 +299,12 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
     examined = part.poses.examined
     town = examined.towns[part.area]
     if part.plan is not None:
-        record_drive(part.folder, part.plan, _world_of(part), part.settings)
+        record_drive(part.folder, part.plan, _world_of(part), part.settings, part.lidar)
     else:
         with whole(part.folder) as partial:
             if part.condition is not None:
-                save_scans(partial, scans_of_town(_world_of(part), town, examined, examined.queries))
+                sensor = None if part.lidar is VLP16 else Lidar(part.lidar)
+                save_scans(partial, scans_of_town(_world_of(part), town, examined, examined.queries, sensor))
             else:
                 write_part([part.survey], partial / _TOWN_SURVEY, 0.0, part.share)
             mark_made(partial, part.settings)

@@ -34,7 +34,7 @@ from crossloc3d_ros.workers import EncoderLoader
 
 _log = logging.getLogger(__name__)
 
-VERSION = 2
+VERSION = 3
 LEAST_PER_M2 = 1.5
 """A world made of a sparser survey is not what a robot would see."""
 DIVIDED_PER_M2 = 5.0

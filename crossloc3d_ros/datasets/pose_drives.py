@@ -39,14 +39,16 @@ from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans, load_scans, sav
 from crossloc3d_ros.datasets.set_maps import Progress
 from crossloc3d_ros.datasets.simulated import sources_digest
 from crossloc3d_ros.errors import EvaluationError
-from crossloc3d_ros.formats.bag import open_bag, stamp_ns_of
+from crossloc3d_ros.formats.bag import POINT_CLOUD, open_bag, stamp_ns_of
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.simulation import drive as recording
 from crossloc3d_ros.simulation import lidar, route, traffic, vlp16
 from crossloc3d_ros.simulation.drive import DriveConfig, drive
+from crossloc3d_ros.simulation.lidar import LidarProfile
 from crossloc3d_ros.simulation.real_world import world_from_survey
-from crossloc3d_ros.simulation.route import plan_route
+from crossloc3d_ros.simulation.route import Route, plan_route
+from crossloc3d_ros.simulation.vlp16 import VLP16
 from crossloc3d_ros.simulation.world import World
 from crossloc3d_ros.types import Float64Array, Int64Array
 
@@ -309,43 +311,56 @@ def _record(task: _Task, advance: Callable[[int], None] | None) -> None:
         advance(1)
 
 
-def record_drive(folder: Path, plan: DrivePlan, world: World, settings: dict[str, Any]) -> None:
+def record_drive(
+    folder: Path, plan: DrivePlan, world: World, settings: dict[str, Any], profile: LidarProfile = VLP16
+) -> None:
     """Drive through a world, record a bag, and keep of it in `folder` what the localizer takes.
 
-    `settings`: how it was made, as `settings_of_plan` gives them. Raises RouteError where there is no room to drive.
+    `settings`: how it was made, as `settings_of_plan` gives them. Scans are stamped at the end of the turn, whatever
+    moment the driver of the lidar gives, for their points carry no times. Raises RouteError where there is no room to
+    drive.
     """
     way = plan_route(
         world, plan.length_m, np.random.default_rng([plan.seed, 1]),
         clearance_m=plan.clearance_m, border_m=plan.border_m, speed_m_s=plan.speed_m_s,
     )  # fmt: skip
-    mounting = MountingConfig(z_m=plan.height_m)
-    config = DriveConfig(scan_every=plan.scan_every, mounting=mounting)
+    config = DriveConfig(scan_every=plan.scan_every, mounting=MountingConfig(z_m=plan.height_m), sensor=profile.config)
     with whole(folder) as partial, tempfile.TemporaryDirectory(dir=partial.parent) as work:
-        drive(world, way, Path(work) / "bag", config, seed=plan.seed, start_ns=_START_NS)
-        gravity = GravityFilter(_IMU_TIME_CONSTANT_S)
-        scans: list[RawScan] = []
-        samples: list[tuple[int, float, float, float]] = []
-        with open_bag(Path(work) / "bag") as bag:
-            for topic, recorded_ns, message in bag.messages(["/velodyne_points", "/imu", "/odom"]):
-                stamp_ns = stamp_ns_of(message, recorded_ns)
-                if topic == "/imu":
-                    force = message.linear_acceleration
-                    gravity.update(stamp_ns, np.array([force.x, force.y, force.z]))
-                elif topic == "/odom":
-                    pose = message.pose.pose
-                    heading = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-                    samples.append((stamp_ns, pose.position.x, pose.position.y, heading))
-                else:
-                    true = way.at((stamp_ns - _START_NS) * 1e-9)[0]
-                    up = gravity.up(stamp_ns) if plan.has_imu else None
-                    points = scan_from_pointcloud2(message).points
-                    raw = RawScan(points, true, mounting_matrix(mounting), up, stamp_ns, plan.area)
-                    scans.append(to_grid(raw, world))
-        save_scans(partial, RawScans.of(scans))
-        odometry = np.array([sample[1:] for sample in samples])
-        odometry[:, 2] = np.unwrap(odometry[:, 2])
-        np.savez(partial / ODOMETRY, stamps_ns=np.array([sample[0] for sample in samples]), odometry=odometry)
+        drive(world, way, Path(work) / "bag", config, seed=plan.seed, profile=profile, start_ns=_START_NS)
+        scans, odometry_ns, odometry = _recorded(Path(work) / "bag", plan, way, config.mounting, profile)
+        save_scans(partial, RawScans.of(to_grid(scan, world) for scan in scans))
+        np.savez(partial / ODOMETRY, stamps_ns=odometry_ns, odometry=odometry)
         mark_made(partial, settings)
+
+
+def _recorded(
+    path: Path, plan: DrivePlan, way: Route, mounting: MountingConfig, profile: LidarProfile
+) -> tuple[list[RawScan], Int64Array, Float64Array]:
+    """Return of a bag the scans with local poses, and stamps (M,) and poses (M, 3) of the odometry."""
+    until_end_ns = round(1e9 * (1.0 - profile.stamped_at) / profile.config.rate_hz)
+    gravity = GravityFilter(_IMU_TIME_CONSTANT_S)
+    scans: list[RawScan] = []
+    samples: list[tuple[int, float, float, float]] = []
+    with open_bag(path) as bag:
+        cloud_topic = bag.only_topic(POINT_CLOUD, "a drive has one lidar").name
+        for topic, recorded_ns, message in bag.messages([cloud_topic, "/imu", "/odom"]):
+            stamp_ns = stamp_ns_of(message, recorded_ns)
+            if topic == "/imu":
+                force = message.linear_acceleration
+                gravity.update(stamp_ns, np.array([force.x, force.y, force.z]))
+            elif topic == "/odom":
+                pose = message.pose.pose
+                heading = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
+                samples.append((stamp_ns, pose.position.x, pose.position.y, heading))
+            else:
+                stamp_ns += until_end_ns
+                true = way.at((stamp_ns - _START_NS) * 1e-9)[0]
+                up = gravity.up(stamp_ns) if plan.has_imu else None
+                points = scan_from_pointcloud2(message).points
+                scans.append(RawScan(points, true, mounting_matrix(mounting), up, stamp_ns, plan.area))
+    odometry = np.array([sample[1:] for sample in samples])
+    odometry[:, 2] = np.unwrap(odometry[:, 2])
+    return scans, np.array([sample[0] for sample in samples]), odometry
 
 
 def load_drives(folder: Path) -> list[RawDrive]:

@@ -33,6 +33,7 @@ from crossloc3d_ros.datasets.simulated import SIMULATED, BenchmarkTown, Simulate
 from crossloc3d_ros.errors import ConfigError, EvaluationError
 from crossloc3d_ros.files import write_atomically
 from crossloc3d_ros.simulation import lidar, survey, vlp16
+from crossloc3d_ros.simulation.lidar import Lidar
 from crossloc3d_ros.simulation.real_world import world_from_survey
 from crossloc3d_ros.simulation.survey import fly, write_survey
 from crossloc3d_ros.simulation.town import make_town
@@ -325,11 +326,16 @@ def _make_part(part: _Part, advance: Callable[[int], None] | None) -> None:
         advance(1)
 
 
-def scans_of_town(world: World, town: BenchmarkTown, examined: SimulatedBenchmark, count: int) -> RawScans:
-    """Return so many scans, with poses in the grid, of a town as it stands at the epoch that is not flown."""
+def scans_of_town(
+    world: World, town: BenchmarkTown, examined: SimulatedBenchmark, count: int, sensor: Lidar | None = None
+) -> RawScans:
+    """Return so many scans, with poses in the grid, of a town as it stands at the epoch that is not flown.
+
+    `sensor`: in place of the benchmark's VLP-16, at the same places.
+    """
     rng = np.random.default_rng([town.seed, 2, 1 - town.seed % 2])
     local = world.sample_poses(count, rng, clearance_m=examined.clearance_m, border_m=0.0, tilt_deg=examined.tilt_deg)
-    return RawScans.of(to_grid(scan, world) for scan in raw_scans(world, local, examined, rng))
+    return RawScans.of(to_grid(scan, world) for scan in raw_scans(world, local, examined, rng, sensor))
 
 
 def to_grid(scan: RawScan, world: World, group: int = 0) -> RawScan:

@@ -27,7 +27,7 @@ from crossloc3d_ros.datasets.place_sets import EvaluationSet, PlaceSet
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.formats.las import GROUND
 from crossloc3d_ros.simulation import lidar, survey, vlp16
-from crossloc3d_ros.simulation.lidar import LidarConfig
+from crossloc3d_ros.simulation.lidar import Lidar, LidarConfig
 from crossloc3d_ros.simulation.survey import SurveyConfig, fly
 from crossloc3d_ros.simulation.town import make_town
 from crossloc3d_ros.simulation.vlp16 import Vlp16
@@ -220,13 +220,17 @@ def _scans(
 
 
 def raw_scans(
-    world: World, poses: Float64Array, benchmark: SimulatedBenchmark, rng: np.random.Generator
+    world: World,
+    poses: Float64Array,
+    benchmark: SimulatedBenchmark,
+    rng: np.random.Generator,
+    sensor: Lidar | None = None,
 ) -> Iterator[RawScan]:
     """Yield a scan of each local pose (S, 4, 4), by robots of different heights, with and without an IMU.
 
-    The poses of the scans are those given, in the world's local frame.
+    The poses of the scans are those given, in the world's local frame. `sensor`: in place of the benchmark's VLP-16.
     """
-    sensor = Vlp16(benchmark.sensor)
+    sensor = sensor or Vlp16(benchmark.sensor)
     for pose in poses:
         T_base_lidar = mounting_matrix(MountingConfig(z_m=float(rng.uniform(*benchmark.sensor_height_m))))
         twist = np.array([rng.uniform(0.0, 2.0), 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5)])

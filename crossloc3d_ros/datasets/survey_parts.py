@@ -14,14 +14,12 @@ import numpy as np
 from crossloc3d_ros.aerial_map.survey import read_survey
 from crossloc3d_ros.clouds.survey_ground import classify_ground
 from crossloc3d_ros.errors import EvaluationError
-from crossloc3d_ros.formats.las import GROUND, LazWriter, iter_chunks
+from crossloc3d_ros.formats.las import GROUND, HIGH_NOISE, LOW_NOISE, LazWriter, iter_chunks
 from crossloc3d_ros.geodesy import Projection, parse_crs
 from crossloc3d_ros.types import Float64Array
 
 _MILLIMETRE, _DEGREE_STEP = 0.001, 1e-8
 """Steps of the coordinates written: finer than those of the surveys, so that none is moved."""
-UNCLASSIFIED = 1
-"""ASPRS class of points that are not ground, as far as a filter knows."""
 _CELL_M = 5.0
 """Cells in which the area that a survey covers is counted: a gap of a roof's shadow is none, a missing tile is one."""
 _MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
@@ -47,9 +45,8 @@ def write_part(inputs: Sequence[Path], target: Path, low: float, high: float) ->
     Raises AerialDataError where a file cannot be read, EvaluationError where no point is left.
     """
     survey = read_survey(inputs)
-    scale = _DEGREE_STEP if parse_crs(survey.crs).is_geographic else _MILLIMETRE
     kept = 0
-    with LazWriter(target, survey.crs, scale=scale, offset=np.floor(survey.minimum)) as writer:
+    with LazWriter(target, survey.crs, scale=_step(survey.crs), offset=np.floor(survey.minimum)) as writer:
         for header in survey.headers:
             for chunk in iter_chunks(header.path):
                 numbers = numbers_of(chunk.points)
@@ -64,7 +61,8 @@ def write_part(inputs: Sequence[Path], target: Path, low: float, high: float) ->
 def classify_part(path: Path) -> None:
     """Give a LAZ file's ground points their class, by the filter of the map builder, where none has it.
 
-    Nothing is done to a file that holds points of class 2. Heights and plane coordinates must be in metres.
+    Nothing is done to a file that holds points of class 2. Noise is no ground; what is none keeps its class. Raises
+    AerialDataError where the file cannot be read.
     """
     survey = read_survey([path])
     chunks = list(iter_chunks(path))
@@ -72,9 +70,15 @@ def classify_part(path: Path) -> None:
     classes = np.concatenate([chunk.classification for chunk in chunks])
     if (classes == GROUND).any():
         return
-    classes = np.where(classify_ground(points), GROUND, UNCLASSIFIED).astype(np.uint8)
-    with LazWriter(path, survey.crs, scale=_MILLIMETRE, offset=np.floor(survey.minimum)) as writer:
+    grid = Projection(survey.crs, survey.map_crs, survey.vertical_metres_per_unit)(points)
+    grid[np.isin(classes, (LOW_NOISE, HIGH_NOISE))] = np.nan
+    classes[classify_ground(grid)] = GROUND
+    with LazWriter(path, survey.crs, scale=_step(survey.crs), offset=np.floor(survey.minimum)) as writer:
         writer.write(points, classes)
+
+
+def _step(crs: str) -> float:
+    return _DEGREE_STEP if parse_crs(crs).is_geographic else _MILLIMETRE
 
 
 def density_per_m2(inputs: Sequence[Path]) -> float:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,13 +100,12 @@ def fit_alignment(
         others = [counts for name, counts in seen.items() if name != fold]
         model = _model(_sum(others), np.array(_INITIAL))
         for each in of_fold:
-            aligner = Aligner(AerialMap.load(each.map_folder), config or AlignmentConfig(), model)
-            for scan, on_map in _scans(each):
-                poses = _measured_poses(each.name, aligner, scan, on_map)
-                measured += [] if poses is None else [poses]
-                done += 1
-                report("aligning", done, total, "scans")
-            aligner.close()
+            with closing(Aligner(AerialMap.load(each.map_folder), config or AlignmentConfig(), model)) as aligner:
+                for scan, on_map in _scans(each):
+                    poses = _measured_poses(each.name, aligner, scan, on_map)
+                    measured += [] if poses is None else [poses]
+                    done += 1
+                    report("aligning", done, total, "scans")
     return _model(everything, fit_weights(measured)), measured
 
 
@@ -113,9 +113,12 @@ def fit_weights(measured: Sequence[MeasuredPoses]) -> Float64Array:
     """Return the weights (M + 1,) under which the right poses are likeliest: none is negative but for the constant.
 
     A conditional logit: log odds of pose i to the null hypothesis are weights . measures + constant + log prior. Each
-    set counts by the square root of its scans, so that no large one decides alone.
+    set counts by the square root of its scans, so that no large one decides alone. Raises TrainingError where no
+    pose is right.
     """
     some = [poses for poses in measured if len(poses.measures)]
+    if not any(poses.right is not None for poses in some):
+        raise TrainingError("no scan was found on its map: are the scans' poses those of the maps?")
     measures = np.concatenate([poses.measures for poses in some])
     scan = np.repeat(np.arange(len(some)), [len(poses.measures) for poses in some])
     prior = np.array([poses.log_prior for poses in some])[scan]
@@ -209,7 +212,8 @@ def _seen_by_fold(sets: Sequence[LearningSet], report: Progress) -> Mapping[str,
             evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
             true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
             _lay(evidence, likelihood, true, seen[0])
-            for place in others[rng.integers(0, len(others), _OTHERS)]:
+            # A map without open ground says nothing of other places.
+            for place in others[rng.integers(0, len(others), _OTHERS)] if len(others) else others:
                 _lay(evidence, likelihood, np.append(place, rng.uniform(-math.pi, math.pi)), seen[1])
             done += 1
             report("learning", done, total, "scans")

@@ -32,6 +32,7 @@ TOWN = SimulatedPoses(
 )  # fmt: skip
 PLANS = tuple(DrivePlan(f"drive {i}", i, 20.0, 2.5, 5, i, True, 1.2, 0.0) for i in range(2))
 THIN, AGED, FEW = Condition("0.5 points/m2", 0.5), Condition("aged", is_aged=True), Condition("few", every_point=20)
+BEAMS = Condition("64 beams", lidar="os1-64")
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_belief_is_predicted_piece_by_piece_and_scored_again(
         "--set", "alignment.scope=candidates", "--set", "alignment.candidates=5",
     ]  # fmt: skip
     monkeypatch.setitem(pose_sets.POSE_SETS, "simulated_small", TOWN)
-    monkeypatch.setattr(belief_sets, "CONDITIONS", (DELIVERED, THIN, AGED, FEW))
+    monkeypatch.setattr(belief_sets, "CONDITIONS", (DELIVERED, THIN, AGED, BEAMS, FEW))
     monkeypatch.setattr(halves, "_DRIVE_M", 20.0)
     monkeypatch.setattr(halves, "_DRIVES", 1)
     monkeypatch.setattr(halves, "_SCANS", 3)
@@ -116,8 +117,8 @@ def test_belief_is_predicted_piece_by_piece_and_scored_again(
     results = json.loads((output / "results.json").read_text())
     conditions = [(each["condition"], each["learned_from"], each["singles"]) for each in results["sets"]]
     assert conditions == [
-        ("as delivered", False, 3), ("0.5 points/m2", False, 3), ("aged", False, 3), ("few", False, 3),
-        ("as delivered", True, 3),
+        ("as delivered", False, 3), ("0.5 points/m2", False, 3), ("aged", False, 3), ("64 beams", False, 3),
+        ("few", False, 3), ("as delivered", True, 3),
     ]  # fmt: skip
     # The drive off the map on the town's, both on the park's; the park's own drive is learned from.
     pairs = {(pair["map_name"], pair["set_name"], pair["drive"]) for pair in results["pairs"]}
@@ -126,7 +127,7 @@ def test_belief_is_predicted_piece_by_piece_and_scored_again(
         ("park", "simulated_small", "drive 1"),
     }  # fmt: skip
     made = {path: path.stat().st_mtime_ns for path in (output / "pieces").glob("*.npz")}
-    assert len(made) == 5 * 2 + 3
+    assert len(made) == 6 * 2 + 3
     table = (output / "table.md").read_text()
 
     victim, *_ = made
@@ -141,4 +142,4 @@ def test_belief_is_predicted_piece_by_piece_and_scored_again(
     assert "Off the map" in capsys.readouterr().out
     victim.unlink()
     assert evaluate.main([*arguments, "--only-score"]) == 0
-    assert "1 of 13 pieces are missing" in (output / "index.html").read_text()
+    assert "1 of 15 pieces are missing" in (output / "index.html").read_text()

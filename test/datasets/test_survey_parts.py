@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossloc3d_ros.datasets.survey_parts import density_per_m2, numbers_of, write_part
+from crossloc3d_ros.datasets.survey_parts import classify_part, density_per_m2, numbers_of, write_part
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.formats.las import iter_chunks, write_laz
+from crossloc3d_ros.geodesy import Projection
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +79,42 @@ def test_a_part_without_points_is_refused(survey: Path, tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="none of the 40,000 points"):
         write_part([survey], tmp_path / "none.laz", 0.5, 0.5)
     assert not (tmp_path / "none.laz").exists()
+
+
+def yard(crs: str, folder: Path, classes: tuple[int, int], noise: int = 7) -> tuple[Path, np.ndarray]:
+    """Write lawns and huts of two classes and low noise, 6 points/m2; return the file and which points are lawn."""
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(0, 80, (38_400, 2))
+    is_hut = (np.abs((xy + 10) % 20 - 10) < 4).all(axis=1)
+    z = 100.0 + np.where(is_hut, 3.5, 0.0) + rng.normal(0, 0.02, len(xy))
+    kinds = np.where(is_hut, classes[1], classes[0]).astype(np.uint8)
+    kinds[:40], z[:40] = noise, 96.0
+    points = np.column_stack([xy + np.array([628_000.0, 5_803_000.0]), z])
+    points = Projection("EPSG:32631", crs)(points)
+    path = folder / "yard.laz"
+    write_laz(path, points, kinds, crs, scale=1e-8 if crs == "EPSG:4326" else 0.001)
+    return path, ~is_hut & (kinds != noise)
+
+
+def test_a_survey_that_has_ground_is_left_alone(tmp_path: Path) -> None:
+    path, _ = yard("EPSG:32631", tmp_path, (2, 1))
+    before = path.read_bytes()
+    classify_part(path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32631", "EPSG:28992", "EPSG:4326", "EPSG:2225"])
+def test_ground_is_found_where_none_has_its_class(crs: str, tmp_path: Path) -> None:
+    """In metres, degrees and feet; what is no ground keeps its class, and no point is moved."""
+    path, is_lawn = yard(crs, tmp_path, (1, 6))
+    before = list(iter_chunks(path))
+    classify_part(path)
+    after = list(iter_chunks(path))
+    points, classes = (
+        np.concatenate([getattr(chunk, name) for chunk in after]) for name in ("points", "classification")
+    )
+    np.testing.assert_allclose(points, np.concatenate([chunk.points for chunk in before]), rtol=0, atol=1e-3)
+    assert (classes[is_lawn] == 2).mean() > 0.98
+    others = np.concatenate([chunk.classification for chunk in before])
+    assert (classes[~is_lawn] == others[~is_lawn]).mean() > 0.98
+    assert (classes[others == 7] == 7).all(), "noise is no ground"

@@ -12,7 +12,8 @@ LEAST_PLACES = 200
 """And so many fixes, of so many places 25 m apart, that none is wrong."""
 
 _SURE = {"8 points/m2": (0.95, 0.99), "2 points/m2": (0.90, 0.97), "0.5 points/m2": (0.70, 0.90)}
-_CALIBRATED = ("8 points/m2", "0.5 points/m2", "as delivered", "aged")
+_CALIBRATED = ("8 points/m2", "0.5 points/m2", "as delivered", "64 beams", "aged")
+"""As delivered, scans are those of 16 beams."""
 _RIGHT = {"amsterdam": (0.92, 0.97), "every 20th point": (0.60, 0.85)}
 _OTHER_REAL_RIGHT = (0.80, 0.90)
 
