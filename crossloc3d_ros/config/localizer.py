@@ -143,6 +143,12 @@ class FusionConfig:
     )
     likelihood_weight: float = option(1.0, "factor on the log likelihoods of scans", low=0.01, high=10.0)
     max_log_likelihood: float = option(15.0, "largest log likelihood ratio of one scan", low=1.0, high=1000.0)
+    null_log_likelihood: float = option(
+        9.0,
+        "log likelihood ratio that a wrong hypothesis reaches in scan after scan; what is above counts for a hypothesis",
+        low=0.0,
+        high=100.0,
+    )
     clutter_probability: float = option(
         0.05, "probability that a scan carries no information on the pose", low=1e-6, high=0.9
     )

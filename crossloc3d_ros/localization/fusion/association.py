@@ -78,7 +78,8 @@ def branch(before: Mixture, poses: AlignedPoses, novelty: float, travelled_m: fl
         return Branches(before, np.empty(0, np.int64), np.empty(0))
     log_clutter = math.log(config.clutter_probability)
     found = innovations(before, poses, config)
-    log_detected = math.log1p(-config.clutter_probability) + found.log_likelihood
+    # What follows a hypothesis is not independent of what it was born of: a wrong one goes on to fit for a while.
+    log_detected = math.log1p(-config.clutter_probability) + found.log_likelihood - config.null_log_likelihood
     evidence = log_sum(np.concatenate([log_detected, np.full((n, 1), log_clutter)], axis=1), axis=1)
     moved_on, gain = _spot_evidence(before, evidence, novelty)
     total = before.log_weight + gain
@@ -110,7 +111,7 @@ def births(
     rows = np.flatnonzero(log_weight > explained)
     return new_hypotheses(
         poses.grid[rows], poses.heading_rad[rows], poses.covariance[rows], log_weight[rows], config,
-        log_likelihood[rows],
+        log_likelihood[rows] - config.null_log_likelihood,
     )  # fmt: skip
 
 
@@ -128,7 +129,8 @@ def _late_detection(mixture: Mixture, log_likelihood: Float64Array, config: Fusi
     explained_m = float(mixture.explained_m[leader])
     if not (mean > 0.0 and accumulated > 0.0 and math.isfinite(explained_m)):
         return None
-    short = accumulated * (np.clip(log_likelihood / mean, 0.0, 1.0) - 1.0) + log_likelihood - mean
+    own = log_likelihood - config.null_log_likelihood
+    short = accumulated * (np.clip(own / mean, 0.0, 1.0) - 1.0) + own - mean
     missed = explained_m / config.novelty_m * math.log1p(-config.detection_probability)
     return np.asarray(float(mixture.log_weight[leader]) + short + missed)
 

@@ -94,7 +94,7 @@ def test_poses_are_found_without_bias_in_every_heading(aligner: Aligner, box_tow
         found = aligner.align(box_town.scan(x, y, heading, rng), BASE, near)
         check(found)
         (east, north), turned = errors(found, x, y, heading)
-        assert math.hypot(east, north) < 1.0, f"{east:.2f}, {north:.2f} m off at {heading:.2f} rad"
+        assert math.hypot(east, north) < 1.3, f"{east:.2f}, {north:.2f} m off at {heading:.2f} rad"
         assert abs(turned) < math.radians(1.0)
         assert found.probabilities[0] > 0.9
         converged += found.converged[0]
