@@ -145,7 +145,7 @@ class FusionConfig:
     max_log_likelihood: float = option(15.0, "largest log likelihood ratio of one scan", low=1.0, high=1000.0)
     null_log_likelihood: float = option(
         9.0,
-        "log likelihood ratio that a wrong hypothesis reaches in scan after scan; what is above counts for a hypothesis",
+        "log likelihood ratio that a wrong hypothesis may reach scan after scan: only what is above counts for one",
         low=0.0,
         high=100.0,
     )
