@@ -142,7 +142,7 @@ class FusionConfig:
         10.0, "distance travelled over which a scan becomes independent of those before", low=0.1, high=1000.0
     )
     likelihood_weight: float = option(1.0, "factor on the log likelihoods of scans", low=0.01, high=10.0)
-    max_log_likelihood: float = option(15.0, "largest log likelihood ratio of one scan", low=1.0, high=1000.0)
+    max_log_likelihood: float = option(20.0, "largest log likelihood ratio of one scan", low=1.0, high=1000.0)
     null_log_likelihood: float = option(
         9.0,
         "log likelihood ratio that a wrong hypothesis may reach scan after scan: only what is above counts for one",

@@ -23,6 +23,7 @@ Array = npt.NDArray[np.float64]
 
 # As the worlds below are, which need not be as the defaults are.
 CONFIG = FusionConfig(
+    null_log_likelihood=0.0,  # the log likelihoods of these worlds are those of independent scans
     novelty_m=20.0, confirm_m=3.0, measurement_std_scale=1.0, measurement_error_correlation=0.8,
     measurement_correlation_m=5.0, measurement_min_std_m=0.1, measurement_min_std_deg=0.2,
 )  # fmt: skip

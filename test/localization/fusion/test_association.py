@@ -27,7 +27,7 @@ def test_a_pose_found_twice_counts_once(worlds: Any) -> None:
 
 
 def test_however_well_a_scan_fits_it_is_no_proof_but_distinguishes_places(worlds: Any) -> None:
-    tracker = Tracker(FusionConfig(max_log_likelihood=12.0))
+    tracker = Tracker(FusionConfig(max_log_likelihood=12.0, null_log_likelihood=0.0))
     tracker.predict(0, None)
     belief = tracker.update(worlds.aligned_at([(0, 0, 0), (200, 0, 0)], [80.0, 77.0]))
     none = 1 - belief.hypotheses.probabilities.sum()
@@ -105,3 +105,19 @@ def test_a_pose_that_is_detected_late_is_granted_the_evidence_that_it_would_have
     odds = belief.hypotheses.probabilities[1] / belief.hypotheses.probabilities[0]
     assert odds == pytest.approx((1 - worlds.CONFIG.detection_probability) ** (15 / worlds.CONFIG.novelty_m), rel=0.5)
     assert not belief.is_fix
+
+
+def driven(worlds: Any, log_likelihood: float, null_log_likelihood: float) -> float:
+    """Return the probability after ten scans, 12 m apart, that fit one pose moving along by so much each."""
+    config = dataclasses.replace(worlds.CONFIG, null_log_likelihood=null_log_likelihood)
+    tracker, step = Tracker(config), np.array([12.0, 0.0, 0.0])
+    for k in range(10):
+        tracker.predict(k * worlds.SECOND * 5, Motion(step, motion_covariance(12.0, 0.0, config)) if k else None)
+        belief = tracker.update(worlds.aligned_at([(12.0 * k, 0, 0)], [log_likelihood]))
+    return float(belief.probability)
+
+
+def test_what_wrong_hypotheses_reach_scan_after_scan_is_no_evidence(worlds: Any) -> None:
+    assert driven(worlds, 7.0, 0.0) > 0.999
+    assert driven(worlds, 7.0, 9.0) < 0.5
+    assert driven(worlds, 20.0, 9.0) > 0.999, "what is above still counts"

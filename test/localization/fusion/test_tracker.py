@@ -31,7 +31,7 @@ def test_a_robot_that_has_seen_nothing_believes_nothing(worlds: Any) -> None:
 
 @given(st.lists(st.floats(-20, 20), min_size=1, max_size=9))
 def test_after_one_scan_the_belief_is_that_of_the_scan_alone(worlds: Any, levels: list[float]) -> None:
-    config = FusionConfig(clutter_probability=1e-6, max_log_likelihood=1000.0)
+    config = FusionConfig(clutter_probability=1e-6, max_log_likelihood=1000.0, null_log_likelihood=0.0)
     aligned = worlds.aligned_at([(100.0 * i, 0, 0) for i in range(len(levels))], levels)
     tracker = Tracker(config)
     tracker.predict(0, None)
