@@ -281,7 +281,8 @@ def test_odometry_that_stands_still_while_the_robot_drives(ride: Ride) -> None:
     robot = localized(ride)
     told = robot.drive(robot.ahead(24), step=lambda moved: np.eye(4))
     no_fix_is_wrong(told)
-    says(told[-8:], "odometry and map disagree")
+    # Where the doubt is so large that the pose is born anew, there is nothing for a while that could disagree.
+    assert sum("odometry and map disagree" in each.estimate.reason for each in told[-8:]) >= 4, said(told)
     found(robot, robot.ahead(25))
 
 
