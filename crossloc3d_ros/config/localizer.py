@@ -118,6 +118,12 @@ class AlignmentConfig:
     descriptor_weight: float = option(
         0.5, "weight of the descriptors' log likelihood ratio beside the alignment's", low=0.0, high=10.0
     )
+    local_map_m: float = option(
+        30.0,
+        "scans of the last metres that are aligned together, along odometry; 0 = each scan by itself",
+        low=0.0,
+        high=200.0,
+    )
     min_cells: int = option(100, "a scan with evidence in fewer cells is not aligned", low=1, high=100_000)
     place_m2: float = option(
         100.0, "area of one place: its share of the map's area is the prior of a pose", low=0.01, high=1e6

@@ -12,6 +12,8 @@ from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
+from crossloc3d_ros.localization.alignment.evidence import evidence_of
+from crossloc3d_ros.localization.alignment.local_map import LocalMap
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
 from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.fusion.priors import PosePrior
@@ -51,6 +53,7 @@ class Localizer:
         self._is_warm = False
         self._tracker = Tracker(config.fusion)
         self._schedule = SearchSchedule(config.alignment)
+        self._local_map = LocalMap(config.alignment.local_map_m)
         self.reconfigure(config)
 
     @property
@@ -115,6 +118,7 @@ class Localizer:
         self.calibration = effective_calibration(config.retrieval, self.encoder)
         self._tracker.reconfigure(config.fusion)
         self._schedule.reconfigure(config.alignment)
+        self._local_map.length_m = config.alignment.local_map_m
         if config.alignment.scope == "none":
             self._aligner = None
         elif self._aligner is None:
@@ -128,6 +132,7 @@ class Localizer:
         """Forget every hypothesis: the robot may be anywhere."""
         self._tracker.reset()
         self._schedule.reset()
+        self._local_map.clear()
 
     def warm_up(self) -> None:
         """Run every step once, so that the first scan is as fast as the others.
@@ -164,7 +169,12 @@ class Localizer:
         """Align at the hypotheses; around the candidates and on the whole map when a search is due."""
         config, schedule = self.config.alignment, self._schedule
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy)
+        if not self._tracker.skips:
+            motion = self._tracker.motion
+            self._local_map.move(motion.delta if motion.is_known else None)
+            evidence = self._local_map.add(evidence)
+        alignment = aligner.begin(evidence, _first(found, config.candidates))
         if alignment is None:
             return no_aligned_poses()
         alignment.refine_hypotheses(hypotheses)

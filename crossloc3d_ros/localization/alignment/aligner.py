@@ -110,18 +110,12 @@ class Aligner:
         """Return whether a scan has evidence in enough cells to be aligned."""
         return len(evidence_of(prepared.place, prepared.sensor_height_m)) >= self.config.min_cells
 
-    def begin(
-        self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Candidates
-    ) -> Alignment | None:
-        """Return the alignment of a scan, without any search yet; None for a scan of too little evidence.
+    def begin(self, evidence: Evidence, candidates: Candidates) -> Alignment | None:
+        """Return the alignment of a scan, or of a local map of several, without any search yet; None for too little.
 
-        `sensor_xy_m`: where the sensor is on the base. The candidates' probabilities count wherever the poses come
-        from.
+        The candidates' probabilities count wherever the poses come from.
         """
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
-        if len(evidence) < self.config.min_cells:
-            return None
-        return Alignment(self, evidence, candidates)
+        return None if len(evidence) < self.config.min_cells else Alignment(self, evidence, candidates)
 
     def align(
         self,
@@ -133,8 +127,12 @@ class Aligner:
         search_candidates: bool = True,
         search_map: bool = False,
     ) -> AlignedPoses:
-        """Return where the scan fits, best first: around the candidates, on the whole map, at the hypotheses."""
-        alignment = self.begin(prepared, sensor_xy_m, candidates)
+        """Return where the scan fits, best first: around the candidates, on the whole map, at the hypotheses.
+
+        `sensor_xy_m`: where the sensor is on the base.
+        """
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
+        alignment = self.begin(evidence, candidates)
         if alignment is None:
             return no_aligned_poses()
         if search_candidates:

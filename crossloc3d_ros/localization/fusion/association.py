@@ -90,14 +90,15 @@ def branch(before: Mixture, poses: AlignedPoses, novelty: float, travelled_m: fl
         correct(moved_on, poses, found, h, i, travelled_m, config),
         log_weight=(total[:, None] + log_detected - evidence[:, None])[h, i],
     )
-    # A robot that was carried away just now fits where it was expected by chance alone: nothing was selected to fit there.
+    # A robot that was carried away just now fits by chance alone where it was expected: nothing was selected there.
     log_unseen = total - _or_clutter(log_fitting, log_clutter)
     return Branches(unseen.join(seen), np.concatenate([np.full(n, -1), i]), log_unseen)
 
 
 def _or_clutter(log_detected: Float64Array, log_clutter: float) -> Float64Array:
     """Return the evidence (n,) for hypotheses that explain poses (n, m) by as much, or the scan as clutter."""
-    return log_sum(np.concatenate([log_detected, np.full((len(log_detected), 1), log_clutter)], axis=1), axis=1)
+    clutter = np.full((len(log_detected), 1), log_clutter)
+    return np.asarray(log_sum(np.concatenate([log_detected, clutter], axis=1), axis=1))
 
 
 def births(
