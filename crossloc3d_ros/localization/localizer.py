@@ -169,12 +169,12 @@ class Localizer:
         """Align at the hypotheses; around the candidates and on the whole map when a search is due."""
         config, schedule = self.config.alignment, self._schedule
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy)
+        newest = evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy)
         if not self._tracker.skips:
             motion = self._tracker.motion
             self._local_map.move(motion.delta if motion.is_known else None)
-            evidence = self._local_map.add(evidence)
-        alignment = aligner.begin(evidence, _first(found, config.candidates))
+            evidence = self._local_map.add(newest)
+        alignment = aligner.begin(evidence, _first(found, config.candidates), newest)
         if alignment is None:
             return no_aligned_poses()
         alignment.refine_hypotheses(hypotheses)

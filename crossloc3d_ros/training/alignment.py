@@ -50,7 +50,7 @@ NEAR_M = 10.0
 _OTHERS = 8  # wrong poses that the evidence of each scan is counted at
 _POSES = 16  # of each scan that the weights are fitted to: the worse ones decide nothing
 _RIDGE = 0.01  # of the standardized weights: measures that say the same share their weight
-_INITIAL = (5.0, 8.0, 5.0, -3.0)  # weights before any are learned, for the order of the poses alone
+_INITIAL = (6.0, 7.0, 5.0, 4.0, 4.0, -3.0)  # weights before any are learned, for the order of the poses alone
 
 Progress = Callable[[str, float, float, str], None]
 
