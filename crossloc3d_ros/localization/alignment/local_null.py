@@ -55,7 +55,7 @@ def measures(
     poses: Float64Array,
     pool: ThreadPool = SERIAL,
 ) -> Float64Array:
-    """Return the `MEASURES` (p, M - 1) of poses (p, 3) with scores (p,), nats, all but how far behind the best they are.
+    """Return the `MEASURES` (p, M - 1) of poses (p, 3) with scores (p,), nats; all but the last of them.
 
     `evidence`: all that the scores are sums over; `sample`: as much of it as the surroundings are compared by.
     """
