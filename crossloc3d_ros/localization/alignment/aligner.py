@@ -58,6 +58,7 @@ MAP_COARSE_FACTOR, MAP_FINE_FACTOR = 4, 2
 """So many times as many maxima are refined on the whole map as around candidates."""
 _PLACE_M = 35.0  # so far from the centre of its submap a pose is still of its place
 _NOT_RETRIEVED = 0.2  # likelihood ratio of a place that is not among the candidates
+_BEYOND_NEWEST = 8.0  # nats: the newest scan of a local map refutes a pose that only the scans before it speak for
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)  # poses this near belong to one maximum
 _EXPLAINED = MEASURES.index("explained")
 # Where the score is sampled for the covariance: about two standard deviations of a good pose to each side.
@@ -179,6 +180,7 @@ class Alignment:
         self._fine = fine_evidence(evidence)
         self._climb_evidence = self._fine.sample(_CLIMB_HITS, _CLIMB_FREE)
         self._newest = None if newest is None or newest is evidence else fine_evidence(newest)
+        self._newest_known: dict[bytes, tuple[float, Float64Array]] = {}
         self._maxima, self._is_refined = no_peaks(), np.empty(0, np.bool_)
         self._most_refined = 0
         self._found, self._tracked = _no_poses(), _no_poses()
@@ -276,7 +278,9 @@ class Alignment:
         found = self._found.take(merge(self._found.poses, order, _SAME_M, _SAME_RAD))
         poses = found.join(self._tracked)
         measured = with_behind_best(poses.measures, poses.scores, len(self._fine))
-        log_likelihood = self._aligner.model.log_likelihood(measured) + self._descriptor_log_ratios(poses.poses)
+        log_likelihood = self._aligner.model.log_likelihood(measured)
+        log_likelihood = np.minimum(log_likelihood, self._of_newest(poses, log_likelihood) + _BEYOND_NEWEST)
+        log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses)
         order = np.argsort(-log_likelihood, kind="stable")
         poses, measured, log_likelihood = poses.take(order), measured[order], log_likelihood[order]
         log_odds = log_likelihood + self._aligner.log_prior
@@ -297,6 +301,30 @@ class Alignment:
         """Return distances (p, k) of poses from the candidates' places; infinite where either is none."""
         away = np.hypot(*(poses[:, None, :2] - self._places[None]).transpose(2, 0, 1))
         return np.where(np.isnan(away), np.inf, away)
+
+    def _of_newest(self, poses: _Poses, log_likelihood: Float64Array) -> Float64Array:
+        """Return the log likelihood ratios (p,) of the newest scan of a local map alone, where the whole speaks for one.
+
+        Infinite where it does not, and where there is no local map.
+        """
+        alone = np.full(len(log_likelihood), np.inf)
+        some = np.flatnonzero(log_likelihood > 0.0)
+        if self._newest is None or not len(self._newest) or not len(some):
+            return alone
+        missing = [i for i in some.tolist() if poses.poses[i].tobytes() not in self._newest_known]
+        if missing:
+            at = poses.poses[missing]
+            sample = self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
+            scores = scores_at(self._newest, self._likelihood, at, self._pool)
+            found = measures(self._newest, sample, scores, self._likelihood, at, self._pool)
+            for i, score, row in zip(missing, scores.tolist(), found, strict=True):
+                self._newest_known[poses.poses[i].tobytes()] = (score, row)
+        known = [self._newest_known[poses.poses[i].tobytes()] for i in some.tolist()]
+        measured = with_behind_best(
+            np.array([row for _, row in known]), np.array([s for s, _ in known]), len(self._newest)
+        )
+        alone[some] = self._aligner.model.log_likelihood(measured)
+        return alone
 
     def _where_exactly(self, poses: Float64Array, log_likelihood: Float64Array) -> Float64Array:
         """Return poses (p, 3), those that count at all moved to where the newest scan of a local map fits best."""

@@ -23,7 +23,7 @@ from crossloc3d_ros.types import BoolArray, Float64Array, Int64Array, UInt8Array
 SPACING_M = 2.0
 """One scan is kept every so many metres."""
 _HIT_SHARE = 0.25  # of the scans that saw a cell: beams pass beside a trunk or through a hedge more often than not
-_LEAST_AGREEMENT = 0.75  # on a way of its own a scan has 0.92 and more, on another one mostly 0.3
+_LEAST_AGREEMENT = 0.85  # on a way of its own a scan has 0.92 and more, on another one mostly 0.3
 _LEAST_COMPARED = 50  # cells that a scan hit and others saw: of fewer, their share says nothing
 _HALF = math.ceil(REACH_M / CELL_M)  # what lies farther away is left out: around a place, maps are prepared so far
 
