@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.consistency import check_echoes, check_placement, check_submaps
 from crossloc3d_ros.aerial_map.coverage import Coverage
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.geotiff import read_geotiff
@@ -173,7 +174,7 @@ class AerialMap:
 
     @classmethod
     def load(cls, path: str | Path, encoder_fingerprint: str | None = None) -> AerialMap:
-        """Open a map folder, checking version, checksums and, where given, that this encoder made it.
+        """Open a map folder, checking version, checksums, that it agrees with itself, and, where given, its encoder.
 
         Raises MapError with a sentence that says what to do.
         """
@@ -196,7 +197,18 @@ class AerialMap:
         frame = MapFrame(manifest.crs, np.array(manifest.origin), manifest.geoid_separation_m)
         support = folder / SUPPORT if any(record.name == SUPPORT for record in manifest.files) else None
         rasters = (folder / TERRAIN, folder / SURFACE, folder / LOWEST, support)
-        return cls(folder, manifest, frame, submaps, index, *rasters)
+        opened = cls(folder, manifest, frame, submaps, index, *rasters)
+        opened._check()
+        return opened
+
+    def _check(self) -> None:
+        """Raise MapError where manifest, rasters and submaps are not of one map."""
+        manifest, grid = self.manifest, self.submaps.grid
+        rasters = [self.terrain_path, self.surface_path, self.lowest_path]
+        rasters += [] if self.support_path is None else [self.support_path]
+        check_placement(self.path, manifest.crs, self.bounds, manifest.build.cell_m, manifest.origin, rasters)
+        check_submaps(self.path, grid, self.bounds, manifest.preprocessing.half_extent_m, self.terrain_path)
+        check_echoes(self.path, grid, self.surface_path, self.lowest_path, self.support_path)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -263,6 +263,13 @@ class LocalizerNodeConfig(LocalizerConfig):
         0.2, "time by which that transform is stamped ahead of its scan", low=0.0, high=10.0
     )
 
+    def __post_init__(self) -> None:
+        """Refuse frames that tf2 does not know."""
+        for name in ("global_frame_id", "base_frame_id", "odom_frame_id"):
+            frame = getattr(self, name)
+            if frame.startswith("/"):
+                raise ConfigError(f"'{name}' must not begin with a slash, which tf2 refuses: set '{frame.lstrip('/')}'")
+
 
 def usable_threads() -> int:
     """Return how many threads work on one scan by default: as many as this process may use cores, at most four."""

@@ -27,6 +27,7 @@ from crossloc3d_ros.localization.fusion.mixture import POSITION, merge, no_mixtu
 from crossloc3d_ros.localization.fusion.null_hypothesis import NullHypothesis, complement, normalize
 from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion, unknown_motion
 from crossloc3d_ros.localization.fusion.priors import LARGEST_STD_M, PosePrior, Priors
+from crossloc3d_ros.localization.inputs import check_stamp
 from crossloc3d_ros.types import AlignedPoses, Hypotheses, TrackState
 
 
@@ -81,7 +82,9 @@ class Tracker:
 
         `motion` leads from the last scan that counted (`stamp_ns` of this object) to this one; None = unknown. A
         repeated or late stamp changes nothing; one that lies back by more than `restart_s` forgets everything.
+        PoseError for what is no stamp.
         """
+        check_stamp(stamp_ns, "the stamp of a scan")
         self._skipped = ""
         if self._stamp_ns is not None:
             elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
