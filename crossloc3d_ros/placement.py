@@ -83,9 +83,7 @@ def place(crs: str, points: Float64Array, unit_m: float | None = None) -> Placed
     """
     readings = _readings(crs, unit_m)
     where = [_median_place(text, points) for text in readings]
-    outside = [
-        np.inf if at is None else degrees_outside(text, *at) for text, at in zip(readings, where, strict=True)
-    ]
+    outside = [np.inf if at is None else degrees_outside(text, *at) for text, at in zip(readings, where, strict=True)]
     fitting = [i for i, degrees in enumerate(outside) if degrees <= _margin_deg(crs)]
     inside = [i for i in fitting if outside[i] == 0.0] or fitting
     notes = list(_small_differences(crs, unit_m))

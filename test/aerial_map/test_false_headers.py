@@ -34,13 +34,18 @@ def write(
 ) -> Path:  # fmt: skip
     """Write a file that names its CRS by GeoTIFF keys or by the bytes of a WKT."""
     header = laspy.LasHeader(point_format=point_format, version=version)
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0)) if offset is None else np.full(3, offset)
+    header.scales, header.offsets = (
+        np.full(3, 0.001),
+        np.floor(xyz.min(axis=0)) if offset is None else np.full(3, offset),
+    )
     if offset is not None:
         header.scales = np.full(3, 0.01)
     for record in records:
         header.vlrs.append(record)
     if keys is not None:
-        body = struct.pack("<4H", 1, 1, 0, len(keys)) + b"".join(struct.pack("<4H", k, 0, 1, v) for k, v in keys.items())
+        body = struct.pack("<4H", 1, 1, 0, len(keys)) + b"".join(
+            struct.pack("<4H", k, 0, 1, v) for k, v in keys.items()
+        )
         header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "keys", body))
     if wkt is not None:
         header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "wkt", wkt))
@@ -226,7 +231,9 @@ def test_a_foreign_record_does_not_refuse_the_file(tmp_path: Path, name: str) ->
     np.testing.assert_allclose(read(path), points() + UTM33, atol=1e-3)
 
 
-@pytest.mark.parametrize(("at", "value", "name"), [(131, 0.0, "scale"), (147, np.nan, "scale"), (155, np.inf, "offset")])
+@pytest.mark.parametrize(
+    ("at", "value", "name"), [(131, 0.0, "scale"), (147, np.nan, "scale"), (155, np.inf, "offset")]
+)
 def test_lost_coordinates_are_refused(tmp_path: Path, at: int, value: float, name: str) -> None:
     path = write(tmp_path / "a.las", points() + UTM33, keys={1024: 1, 3072: 32633})
     patch(path, at, "<d", value)
@@ -260,7 +267,9 @@ def test_points_outside_of_the_area_of_their_crs_are_refused_and_near_it_warned_
     assert "outside of the area" in caplog.text
 
 
-def test_the_summary_shows_where_the_map_is_and_how_well_that_is_known(tmp_path: Path, survey: Any, encoder: Any) -> None:
+def test_the_summary_shows_where_the_map_is_and_how_well_that_is_known(
+    tmp_path: Path, survey: Any, encoder: Any
+) -> None:
     # The survey of the other tests in London, in the British grid, whose exact way to WGS84 needs a grid.
     xyz = survey.points - [628_000, 5_803_000, 0] + corner_of("EPSG:27700", -0.1, 51.5)
     write(tmp_path / "a.las", xyz, keys={1024: 1, 3072: 27700})
@@ -275,4 +284,6 @@ def test_the_summary_shows_where_the_map_is_and_how_well_that_is_known(tmp_path:
     assert f"within {datum.metres:g} m in WGS84" in text
     if datum.missing_grids:  # they may be installed
         assert (datum.metres, datum.metres_with_grids) == (2.0, 1.0)
-        assert "warning   without the grid uk_os_OSTN15_NTv2_OSGBtoETRS.tif the error of the survey's datum is 2 m" in text
+        assert (
+            "warning   without the grid uk_os_OSTN15_NTv2_OSGBtoETRS.tif the error of the survey's datum is 2 m" in text
+        )
