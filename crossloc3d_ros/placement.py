@@ -9,11 +9,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest, AreaOfUse
+from pyproj.aoi import AreaOfInterest
 from pyproj.crs import CompoundCRS
 from pyproj.database import get_units_map
 from pyproj.exceptions import CRSError, ProjError
@@ -33,6 +33,16 @@ _SAME_UNIT = 1e-5
 _NORTH_ORIENTATED = {9808: (9807, "Transverse Mercator"), 9819: (1041, "Krovak (North Orientated)")}
 """EPSG methods whose axes point south and west, and those of the same projection whose axes point east and north."""
 _FALSE_ORIGIN = (8806, 8807)
+
+
+class _Area(NamedTuple):
+    """Where the register says that a CRS is used, degrees; east may be less than west."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+    name: str
 
 
 @dataclass(frozen=True)
@@ -87,7 +97,7 @@ def place(crs: str, points: Float64Array, unit_m: float | None = None) -> Placed
     fitting = [i for i, degrees in enumerate(outside) if degrees <= _margin_deg(crs)]
     inside = [i for i in fitting if outside[i] == 0.0] or fitting
     notes = list(_small_differences(crs, unit_m))
-    if len(inside) > 1 and len({np.round(where[i], 5).tobytes() for i in inside}) > 1:
+    if len(inside) > 1 and _differ([where[i] for i in inside]):
         raise AerialDataError(_contradiction(readings, unit_m, "both put it where the CRS is used"))
     if not inside:
         raise AerialDataError(_nowhere(crs, readings, where, points, unit_m))
@@ -129,13 +139,13 @@ def degrees_outside(crs: str, longitude_deg: float, latitude_deg: float) -> floa
     return float(max(sideways, area.south - latitude_deg, latitude_deg - area.north, 0.0))
 
 
-def area_of_use(crs: str) -> AreaOfUse | None:
+def area_of_use(crs: str) -> _Area | None:
     """Return where the register says that a CRS is used, None where it does not say."""
     parsed = parse_crs(horizontal_text(crs))
-    if parsed.area_of_use is not None:
-        return parsed.area_of_use
-    code = parsed.to_epsg()
-    return None if code is None else CRS.from_epsg(code).area_of_use
+    area = parsed.area_of_use
+    if area is None and (code := parsed.to_epsg()) is not None:
+        area = CRS.from_epsg(code).area_of_use
+    return None if area is None else _Area(area.west, area.south, area.east, area.north, area.name or "")
 
 
 def datum_accuracy(crs: str, longitude_deg: float, latitude_deg: float) -> DatumAccuracy:
@@ -147,7 +157,7 @@ def datum_accuracy(crs: str, longitude_deg: float, latitude_deg: float) -> Datum
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # missing grids are part of the answer
-        group = TransformerGroup(parse_crs(horizontal_text(crs)), _WGS84, always_xy=True, area_of_interest=area)
+        group = TransformerGroup(parse_crs(horizontal_text(crs)), _WGS84, always_xy=True, area_of_interest=area)  # type: ignore[arg-type]
     if not group.transformers:
         return DatumAccuracy(None, "none")
     used = group.transformers[0]
@@ -279,6 +289,10 @@ def _median_place(crs: str, points: Float64Array) -> tuple[float, float] | None:
         return place_of(crs, *(float(value) for value in np.median(points[:, :2], axis=0)))
     except AerialDataError:
         return None
+
+
+def _differ(places: list[tuple[float, float] | None]) -> bool:
+    return len({None if at is None else (round(at[0], 5), round(at[1], 5)) for at in places}) > 1
 
 
 def _margin_deg(crs: str) -> float:

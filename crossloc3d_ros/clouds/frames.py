@@ -10,7 +10,7 @@ import numpy as np
 from crossloc3d_ros.clouds.filters import mounting_matrix, transform_points
 from crossloc3d_ros.config import MountingConfig
 from crossloc3d_ros.errors import CloudError
-from crossloc3d_ros.types import Scan
+from crossloc3d_ros.types import Float64Array, Scan
 
 _log = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ class CloudFrames:
 
     def __init__(self, mounting: MountingConfig, base_frame_id: str = "base_link") -> None:
         """Take the clouds of `base_frame_id`, or of a frame that conventions name so, for moved into it already."""
-        self._T_lidar_base = np.linalg.inv(mounting_matrix(mounting))
+        self._T_lidar_base: Float64Array = np.asarray(np.linalg.inv(mounting_matrix(mounting)), np.float64)
         self._bases = {base_frame_id.strip("/"), *_BASE_FRAMES}
         self._frame_id: str | None = None
 
@@ -40,10 +40,11 @@ class CloudFrames:
                 )
         if frame_id != self._frame_id:
             raise CloudError(
-                f"the topic holds clouds of two frames, '{self._frame_id}' and '{frame_id}', and one mounting cannot hold "
-                "for both: those of the first are used; give each lidar a topic of its own, or run the node with "
+                f"the topic holds clouds of two frames, '{self._frame_id}' and '{frame_id}', and one mounting cannot "
+                "hold for both: those of the first are used; give each lidar a topic of its own, or run the node with "
                 "mounting_from_tf"
             )
         if frame_id not in self._bases:
             return scan
-        return replace(scan, points=transform_points(self._T_lidar_base, scan.points))
+        points = transform_points(self._T_lidar_base, scan.points)
+        return replace(scan, points=np.asarray(points, np.float32))

@@ -168,7 +168,8 @@ def _open(path: Path, backend: laspy.LazBackend) -> Iterator[_Opened]:
     repairs = find_repairs(path)
     with laspy.open(open_repaired(path, repairs), laz_backend=backend) as reader:
         chunks, chunk_points = _chunk_table(path, reader)
-        point_count, notes = int(reader.header.point_count), ()
+        point_count = int(reader.header.point_count)
+        notes: tuple[str, ...] = ()
         if repairs is not None:
             point_count = true_count(path, repairs, chunks, chunk_points)
             note = count_note(repairs, point_count)

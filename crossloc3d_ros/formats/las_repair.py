@@ -168,7 +168,7 @@ def _read_raw(file: BinaryIO, path: Path) -> RawHeader | None:
     return RawHeader(
         version_minor=minor, header_size=header_size, points_at=points_at, records=records,
         is_compressed=bool(kind & 0x80), point_size=point_size, count=count, legacy_count=legacy,
-        counted_by_return=by_return, scales=rest[5:8], offsets=rest[8:11],
+        counted_by_return=by_return, scales=tuple(rest[5:8]), offsets=tuple(rest[8:11]),
         extended_at=extended_at, extended_records=extended, points_end=points_end,
     )  # fmt: skip
 

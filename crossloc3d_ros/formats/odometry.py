@@ -39,7 +39,7 @@ def pose_matrix(pose: Any) -> Float64Array:
 
 
 class OdometryPoses:
-    """The poses of one topic of odometry: those of its messages, or its twists integrated where the poses are not filled.
+    """The poses of one topic of odometry: those of its messages, or its twists integrated where no pose is filled in.
 
     Drivers of wheels give a twist, and leave the pose at zero for a filter to fill.
     """

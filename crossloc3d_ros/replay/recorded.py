@@ -73,8 +73,9 @@ def localize_bag(
     """Localize every `every`-th scan of a bag, write the estimates to the CSV file `output` and return their number.
 
     `imu_topic` levels the scans by accelerations in the axes of the base; `odometry` names what measures the motion
-    between them; None = nothing does. Clouds of `base_frame_id` are in the base's frame already. A cloud that cannot be used becomes a row without a fix, with the reason; a bag
-    that breaks off raises BagError when the rows before the break are written.
+    between them; None = nothing does. Clouds of `base_frame_id` are in the base's frame already. A cloud that
+    cannot be used becomes a row without a fix, with the reason; a bag that breaks off raises BagError when the rows
+    before the break are written.
     """
     total = math.ceil(bag.topic(topic, POINT_CLOUD).count / every)
     kind: OdometryKind = "none" if odometry is None else "scan" if odometry.topic is None else "topic"

@@ -100,7 +100,7 @@ def test_coordinates_in_feet_of_a_metric_crs_are_where_they_were_flown(
 
 
 def test_a_unit_that_cannot_be_told_is_refused_with_both_names(tmp_path: Path) -> None:
-    write(tmp_path / "a.las", points() + [500_000, 1_000_000, 0], keys={1024: 1, 3072: 3857, 3076: 9002})
+    write(tmp_path / "a.las", points() + np.array([500_000, 1_000_000, 0]), keys={1024: 1, 3072: 3857, 3076: 9002})
     with pytest.raises(AerialDataError, match=r"a\.las.*metre.*foot.*--crs"):
         read_survey([tmp_path])
     assert read_survey([tmp_path], "EPSG:3857").map_crs == "EPSG:32631"
@@ -109,7 +109,7 @@ def test_a_unit_that_cannot_be_told_is_refused_with_both_names(tmp_path: Path) -
 def test_a_unit_that_contradicts_a_crs_that_fits_is_left_aside(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    metres = points() + [121_000, 487_000, 0]
+    metres = points() + np.array([121_000, 487_000, 0])
     write(tmp_path / "a.las", metres, keys={1024: 1, 3072: 28992, 3076: 9002})
     with caplog.at_level(logging.WARNING):
         assert_places(read_survey([tmp_path]), "EPSG:28992", metres)
@@ -258,7 +258,7 @@ def test_axes_to_south_and_west_are_read_as_they_were_written(
 def test_points_outside_of_the_area_of_their_crs_are_refused_and_near_it_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    write(tmp_path / "a.las", points() + [121_000, 487_000, 0], keys={1024: 1, 3072: 2154})
+    write(tmp_path / "a.las", points() + np.array([121_000, 487_000, 0]), keys={1024: 1, 3072: 2154})
     with pytest.raises(AerialDataError, match=r"a\.las.*lie at 2\.84\d\d S, 0\.75\d\d W by RGF93.*France.*--crs"):
         read_survey([tmp_path])
     assert read_survey([tmp_path], "EPSG:28992").map_crs == "EPSG:32631"

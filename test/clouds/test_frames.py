@@ -37,5 +37,5 @@ def test_two_lidars_on_one_topic_are_told_by_name() -> None:
     frames = CloudFrames(MOUNTING)
     for _ in range(2):
         frames(scan("front"))
-        with pytest.raises(CloudError, match="two frames, 'front' and 'rear'.*a topic of its own"):
+        with pytest.raises(CloudError, match=r"two frames, 'front' and 'rear'.*a topic of its own"):
             frames(scan("rear"))
