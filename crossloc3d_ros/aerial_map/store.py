@@ -29,6 +29,7 @@ from crossloc3d_ros.clouds.raster import Bounds, Raster
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, from_dict
 from crossloc3d_ros.errors import ConfigError, MapError
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.placement import DatumAccuracy
 from crossloc3d_ros.types import Float64Array, Int32Array
 
 FORMAT = "crossloc3d map"
@@ -113,6 +114,8 @@ class Manifest:
     software: str
     coverage: Coverage | None = None
     """How densely and how completely the survey covers the map; null in maps that were not asked."""
+    datum: DatumAccuracy | None = None
+    """How well places in the survey's CRS are known in WGS84; null in maps that were not asked."""
     format: str = FORMAT
     format_version: int = FORMAT_VERSION
 
