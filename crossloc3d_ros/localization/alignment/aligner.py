@@ -303,7 +303,7 @@ class Alignment:
         return np.where(np.isnan(away), np.inf, away)
 
     def _of_newest(self, poses: _Poses, log_likelihood: Float64Array) -> Float64Array:
-        """Return the log likelihood ratios (p,) of the newest scan of a local map alone, where the whole speaks for one.
+        """Return the log likelihood ratios (p,) of the newest scan alone, for poses that the local map speaks for.
 
         Infinite where it does not, and where there is no local map.
         """
