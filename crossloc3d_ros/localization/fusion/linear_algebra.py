@@ -58,7 +58,10 @@ def why_no_covariance(covariance: Float64Array) -> str:
     if not np.isfinite(covariance[~np.eye(3, dtype=bool)]).all():
         return "holds infinite correlations"
     scale = np.sqrt(np.where(known & (variances > 0.0), variances, 1.0))
-    unit = covariance[np.ix_(known, known)] / scale[known, None] / scale[None, known]
+    with np.errstate(over="ignore"):  # of an impossible correlation
+        unit = covariance[np.ix_(known, known)] / scale[known, None] / scale[None, known]
+    if not np.isfinite(unit).all():
+        return "is not positive semidefinite: correlations exceed 1"
     if np.abs(unit - unit.T).max(initial=0.0) > 1e-6:
         return "is not symmetric"
     if np.linalg.eigvalsh(unit).min(initial=0.0) < -1e-3:
