@@ -74,7 +74,7 @@ def room(x_m: float, heading_rad: float) -> np.ndarray:
 
 def cloud(stamp_ns: int, x_m: float = 0.0, heading_rad: float = 0.0, small: bool = True) -> Any:
     points = room(x_m, heading_rad)
-    points += np.random.default_rng(stamp_ns).normal(0.0, 1e-4, points.shape)  # a lidar without noise is a frozen one
+    points += np.random.default_rng(stamp_ns).normal(0.0, 5e-3, points.shape)  # a lidar without noise is a frozen one
     return messages.velodyne_cloud(stamp_ns, "velodyne", points[::40] if small else points, 1.0, 0, 0.0)
 
 
