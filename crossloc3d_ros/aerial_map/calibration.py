@@ -103,7 +103,9 @@ def read_calibration(folder: Path, manifest_sha256: str) -> MapCalibration | Non
     if not isinstance(values, Mapping) or values.get("format") != FORMAT:
         raise MapError(f"{file} is no {FORMAT}; {advice}")
     if values.get("format_version") != FORMAT_VERSION:
-        raise MapError(f"{file} has format version {values.get('format_version')}, this is for {FORMAT_VERSION}; {advice}")
+        raise MapError(
+            f"{file} has format version {values.get('format_version')}, this is for {FORMAT_VERSION}; {advice}"
+        )
     try:
         calibration = from_dict(MapCalibration, values)
         _check(calibration)

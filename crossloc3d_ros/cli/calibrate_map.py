@@ -35,8 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="calibrate_map",
-        description="Drive a simulated lidar through a map, off it too, and leave in the map's folder what a score means "
-        f"there ({CALIBRATION}), where a robot is localized ({RASTER}), and both as a page ({PAGE}).",
+        description="Drive a simulated lidar through a map, off it too, and leave in the map's folder what a score "
+        f"means there ({CALIBRATION}), where a robot is localized ({RASTER}), and both as a page ({PAGE}).",
     )
     parser.add_argument("map", type=Path, help="folder of the aerial map, as build_map writes it")
     parser.add_argument("--weights", type=Path, help="weights file (default: the one that comes with the package)")
@@ -72,8 +72,8 @@ def summary(folder: Path, found: Localizability) -> str:
         ("one scan", f"right in {percent(counts.right / places)}"),
         (
             "localized",
-            f"at once {percent(counts.at_once / places)}, within 20 m {percent(counts.after_20_m / places)} more, within "
-            f"100 m {percent(counts.after_100_m / places)} more, never {percent(counts.never / places)}",
+            f"at once {percent(counts.at_once / places)}, within 20 m {percent(counts.after_20_m / places)} more, "
+            f"within 100 m {percent(counts.after_100_m / places)} more, never {percent(counts.never / places)}",
         ),
         ("wrong", f"{counts.wrong_fixes:,} drives with a fix more than 10 m off"),
         ("offset", f"{calibration.offset:+.2f} on log likelihoods; the most probable one is "

@@ -8,10 +8,15 @@ from collections import Counter as Tally
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 from crossloc3d_ros import __version__
-from crossloc3d_ros.aerial_map.calibration import LocalizabilityCounts, MapCalibration, manifest_digest, write_calibration
+from crossloc3d_ros.aerial_map.calibration import (
+    LocalizabilityCounts,
+    MapCalibration,
+    manifest_digest,
+    write_calibration,
+)
 from crossloc3d_ros.aerial_map.progress import Counter, ProgressCallback
 from crossloc3d_ros.aerial_map.store import MANIFEST, AerialMap
 from crossloc3d_ros.config import LocalizabilityConfig
@@ -73,7 +78,9 @@ def calibrate_map(
             scans = _scan(folder, squares, config, workers, report)
             calibration = _calibration(aerial_map, fit_offset(scans), config)
             tasks = [SquareTask(folder, square, config, calibration) for square in squares]
-            places = _do(drive_square, tasks, [square.places for square in squares], "driving", "drives", workers, report)
+            places = _do(
+                drive_square, tasks, [square.places for square in squares], "driving", "drives", workers, report
+            )
     finally:
         forget()
     calibration = dataclasses.replace(calibration, counts=_counts(scans, places))
@@ -92,7 +99,8 @@ def _scan(
     scans = _do(scan_square, tasks, [square.places for square in squares], "scanning", "scans", workers, report)
     if not scans:
         raise MapError(
-            f"the map {folder} has no street to drive on: no connected open ground of some 100 m; it cannot be calibrated"
+            f"the map {folder} has no street to drive on: no connected open ground of some 100 m; "
+            "it cannot be calibrated"
         )
     towns = town_tasks(folder, config)
     return scans + _do(scan_town, towns, [town.scans for town in towns], "off the map", "scans", workers, report)
@@ -110,19 +118,23 @@ def _do(
     """Return the results of tasks in an order that does not depend on the workers."""
     advance = Counter(stage, 0, sum(sizes), unit, report)
     numbered = [(_Numbered(function, i, task), size) for i, (task, size) in enumerate(zip(tasks, sizes, strict=True))]
-    results = dict(workers.run_encoding(_do_numbered, numbered, advance))
+    results: dict[int, list[Result]] = dict(workers.run_encoding(_do_numbered, numbered, advance))
     return [each for i in range(len(tasks)) for each in results[i]]
 
 
 @dataclass(frozen=True)
-class _Numbered:
-    function: Callable[..., list[object]]
+class _Numbered(Generic[Task, Result]):
+    """A task that is known again when it is done."""
+
+    function: Callable[[Task, DescriptorEncoder, Advance | None], list[Result]]
     number: int
-    task: SquareTask | TownTask
+    task: Task
 
 
-def _do_numbered(task: _Numbered, encoder: DescriptorEncoder, advance: Advance | None) -> tuple[int, list[object]]:
-    return task.number, task.function(task.task, encoder, advance)
+def _do_numbered(
+    numbered: _Numbered[Task, Result], encoder: DescriptorEncoder, advance: Advance | None
+) -> tuple[int, list[Result]]:
+    return numbered.number, numbered.function(numbered.task, encoder, advance)
 
 
 def _calibration(aerial_map: AerialMap, fitted: FittedOffset, config: LocalizabilityConfig) -> MapCalibration:

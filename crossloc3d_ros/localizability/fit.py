@@ -1,9 +1,9 @@
 """The offset that calibrates the belief in single scans on one map.
 
-A scan has aligned poses of log odds z_i to the null hypothesis, log likelihood and prior together. With an offset d, its
-probabilities are those of a conditional logit: exp(z_i + d) / (1 + S exp(d)) of pose i and 1 / (1 + S exp(d)) of the
-null hypothesis, S the sum of all exp(z_i). The likelihood of d depends on the scans by S alone, and on how many of them
-have their right pose among the aligned ones. Beside it stands a normal prior around 0.
+A scan has aligned poses of log odds z_i to the null hypothesis, log likelihood and prior together. With an offset d,
+its probabilities are those of a conditional logit: exp(z_i + d) / (1 + S exp(d)) of pose i and 1 / (1 + S exp(d)) of
+the null hypothesis, S the sum of all exp(z_i). The likelihood of d depends on the scans by S alone, and on how many of
+them have their right pose among the aligned ones. Beside it stands a normal prior around 0.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter as Tally
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,8 +143,8 @@ def limit_words(calibration: MapCalibration) -> str:
     fitted = f"{calibration.unlimited_offset:+.2f} ± {calibration.offset_std:.2f}"
     if calibration.offset < calibration.unlimited_offset:
         return (
-            f"The most probable offset, {fitted}, is lowered to {calibration.offset:+.2f}, so that no scan off the map is "
-            "believed above 99 %."
+            f"The most probable offset, {fitted}, is lowered to {calibration.offset:+.2f}, so that no scan off the map "
+            "is believed above 99 %."
         )
     return f"It is the most probable one, {fitted}; with it no scan off the map is believed above 99 %."
 
@@ -163,9 +164,9 @@ def _facts(aerial_map: AerialMap, calibration: MapCalibration) -> dict[str, str]
 
 
 def _kinds(places: Sequence[DrivenPlace]) -> list[Kind]:
-    classes = np.array([distance_class(place) for place in places])
+    tally = Tally(distance_class(place) for place in places)
     return [
-        Kind(css, WORDS[css], wilson_share(float((classes == value).mean()), len(places)), int((classes == value).sum()))
+        Kind(css, WORDS[css], wilson_share(tally[value] / len(places), len(places)), tally[value])
         for value, css in CLASSES.items()
     ]
 

@@ -1,7 +1,7 @@
 """Which squares of a map are driven, and from how many places.
 
-A map is divided into squares, each with a world of its own. Of a map of many, some are drawn in proportion to their open
-ground, so that time and memory do not grow with the map.
+A map is divided into squares, each with a world of its own. Of a map of many, some are drawn in proportion to their
+open ground, so that time and memory do not grow with the map.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import MapError
 from crossloc3d_ros.simulation.map_world import open_ground
 from crossloc3d_ros.simulation.world import Bounds
-from crossloc3d_ros.types import BoolArray
+from crossloc3d_ros.types import BoolArray, Float32Array
 
 SIDE_M = 340.0
 """Of a square at most; even, so that its middle lies on whole metres."""
@@ -78,7 +78,10 @@ def divided(aerial_map: AerialMap) -> list[Bounds]:
 
 def open_cells(aerial_map: AerialMap, bounds: Bounds) -> BoolArray:
     """Return the cells (H, W) of the map's rasters in some bounds where a robot can stand, row 0 in the north."""
-    return open_ground(aerial_map.surface(tuple(bounds)).values - aerial_map.terrain(tuple(bounds)).values)
+    west, south, east, north = bounds
+    window = (west, south, east, north)
+    above: Float32Array = aerial_map.surface(window).values - aerial_map.terrain(window).values
+    return open_ground(above)
 
 
 def _open_m2(aerial_map: AerialMap, bounds: Bounds) -> float:

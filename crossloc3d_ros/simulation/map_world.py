@@ -101,8 +101,8 @@ def world_of_map(aerial_map: AerialMap, square: Bounds, seed: int, change: Chang
     origin = np.array([(square.min_x + square.max_x) / 2.0, (square.min_y + square.max_y) / 2.0, 0.0])
     points, classes = _points(layers, terrain, rng)
     world = world_from_points(
-        points - origin, classes, Bounds(*_local(window, origin)), name=aerial_map.path.name, crs=aerial_map.manifest.crs,
-        origin_grid=origin, cell_m=terrain.cell_m / 2.0, seed=seed, least_share=0.05,
+        points - origin, classes, Bounds(*_local(window, origin)), name=aerial_map.path.name,
+        crs=aerial_map.manifest.crs, origin_grid=origin, cell_m=terrain.cell_m / 2.0, seed=seed, least_share=0.05,
     )  # fmt: skip
     return dataclasses.replace(world, bounds=Bounds(*_local(square, origin)))
 

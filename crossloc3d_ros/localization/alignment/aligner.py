@@ -167,9 +167,7 @@ class Aligner:
         return np.column_stack([easting, northing, heights])
 
 
-def calibration_offset(
-    aerial_map: AerialMap, model: ObservationModel, config: AlignmentConfig
-) -> tuple[float, str]:
+def calibration_offset(aerial_map: AerialMap, model: ObservationModel, config: AlignmentConfig) -> tuple[float, str]:
     """Return what is added to log likelihoods on a map, nats, and a sentence on its calibration for people.
 
     The sentence is empty where the map was never calibrated.
@@ -177,13 +175,13 @@ def calibration_offset(
     calibration = aerial_map.calibration
     if calibration is None:
         fault = aerial_map.calibration_fault
-        return 0.0, f"the map's calibration is not used: {fault}" if fault else ""
+        return 0.0, f"its calibration is not used: {fault}" if fault else ""
     made_for = f"for a {calibration.lidar} at {calibration.lidar_height_m:g} m"
     if not config.use_calibration:
-        return 0.0, f"the map's calibration {made_for} is not used: alignment.use_calibration is false"
+        return 0.0, f"its calibration {made_for} is not used: alignment.use_calibration is false"
     if calibration.observation_model != model.fingerprint:
         return 0.0, (
-            f"the map's calibration {made_for} is not used: it was made with another observation model; calibrate the "
+            f"its calibration {made_for} is not used: it was made with another observation model; calibrate the "
             f"map again with 'calibrate_map {aerial_map.path}'"
         )
     return calibration.offset, f"calibrated {made_for}: {calibration.offset:+.2f} on log likelihoods"
