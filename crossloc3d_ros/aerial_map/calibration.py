@@ -38,7 +38,7 @@ class LocalizabilityCounts:
     off_map: int = 0
     """Scans of other places."""
     at_once: int = 0
-    """Places that the first scan gives away."""
+    """Places that the first scan gives away, with a right fix within 20 m."""
     after_20_m: int = 0
     """Places with a right fix within 20 m, but not at once."""
     after_100_m: int = 0

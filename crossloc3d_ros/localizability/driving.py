@@ -17,6 +17,7 @@ from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import LocalizabilityConfig, LocalizerConfig, MountingConfig
 from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.localizability.fit import MOST_OFF_MAP
 from crossloc3d_ros.localization.fusion.decision import RIGHT_WITHIN_M
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import Session
@@ -64,7 +65,8 @@ class DrivenPlace:
     rivals: tuple[Rival, ...]
     """The wrong poses of the first scan that have some probability, likeliest first."""
     localized_m: float
-    """Metres until the first right fix, 0 = the first scan gives it away; infinite where there is none."""
+    """Metres until the first right fix; infinite where there is none. 0: it came within 20 m, and the first scan alone
+    had given the right pose more belief than any scan off the map may have."""
     had_wrong_fix: bool
     """Whether a fix was off by more than 10 m."""
 
@@ -158,7 +160,7 @@ def drive_from(
         off_m = float(np.hypot(*(estimate.grid[:2] - truth[:2])))
         if first is None:
             first = estimate, truth
-            is_certain = estimate.probability >= localizer.config.fusion.min_probability and off_m <= RIGHT_WITHIN_M
+            is_certain = float(estimate.aligned.probabilities[is_right(estimate, truth)].sum()) >= MOST_OFF_MAP
         if estimate.status is FixStatus.FIX:
             had_wrong_fix |= off_m > RIGHT_WITHIN_M
             if off_m <= RIGHT_WITHIN_M:
