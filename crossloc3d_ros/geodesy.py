@@ -90,6 +90,13 @@ def utm_crs_of(crs: str, x: float, y: float) -> CRS:
     return utm_crs_for((longitude + 180.0) % 360.0 - 180.0, latitude)
 
 
+def horizontal_text(text: str) -> str:
+    """Return the horizontal part of a CRS, as `crs_text` does."""
+    parsed = parse_crs(text)
+    horizontal = _horizontal(parsed)
+    return text if horizontal is parsed else crs_text(horizontal)
+
+
 def same_crs(first: str, second: str) -> bool:
     """Return whether two texts name the same CRS."""
     return first == second or bool(parse_crs(first).equals(parse_crs(second), ignore_axis_order=True))

@@ -151,7 +151,7 @@ class TrackState(Enum):
     LOCALIZED = "localized"
     """One pose is probable, by more than the threshold."""
     LOST = "lost"
-    """It was localized, and the scans no longer fit."""
+    """It was localized, and the scans no longer fit, or none has been of use for a while."""
 
 
 class FixStatus(Enum):

@@ -132,10 +132,10 @@ def parameters_page() -> str:
         NOTICE,
         "# Parameters of the localizer\n",
         "Every parameter has a default; only `map` must be given. `ros2 param describe /localizer NAME` shows the same "
-        "text. Unknown names and values out of range are refused with the name.\n",
+        "text. Unknown names, values out of range and values that contradict another are refused with the name.\n",
         "`top_k` and the groups `scan`, `retrieval`, `alignment` and `fusion` may be changed while the node runs: the "
         "next scan uses the new values, the hypotheses are kept. The others are read when the node is configured, "
-        "`autostart` when it starts. "
+        "`autostart` when it starts; to set one to the value that it has is no change. "
         "[config/localizer.yaml](../howto/tuning.md#a-parameter-file) holds all of them for editing.\n",
     ]
     for group in groups_of(LocalizerNodeConfig):

@@ -39,6 +39,15 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
+def switch(name: str, text: str) -> bool:
+    """Return what a text of the command line means, as YAML and ROS read it; ValueError where it means neither."""
+    if text.strip().lower() in ("true", "yes", "on", "y", "1"):
+        return True
+    if text.strip().lower() in ("false", "no", "off", "n", "0"):
+        return False
+    raise ValueError(f"{name}:={text}: must be true or false")
+
+
 def start(context: LaunchContext) -> list[LifecycleNode]:
     """Return the node, now that the arguments have values."""
 
@@ -46,10 +55,12 @@ def start(context: LaunchContext) -> list[LifecycleNode]:
         return LaunchConfiguration(name).perform(context)
 
     settings = {
-        name: given(name) if kind is str else given(name).lower() in ("true", "1", "yes")
+        name: given(name) if kind is str else switch(name, given(name))
         for name, (kind, _) in SETTINGS.items()
         if given(name)
     }
+    if not Path(given("params_file")).is_file():  # launch itself would warn, and run on with the defaults
+        raise ValueError(f"params_file:={given('params_file')}: there is no such file")
     return [
         LifecycleNode(
             package="crossloc3d_ros",

@@ -88,6 +88,7 @@ def _manifest(
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=f"crossloc3d_ros {__version__}",
         coverage=survey_coverage(report.coverage for report in built.reports),
+        datum=survey.datum,
     )
 
 

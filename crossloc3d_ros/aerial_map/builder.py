@@ -17,7 +17,7 @@ from crossloc3d_ros.aerial_map.assemble import write_map
 from crossloc3d_ros.aerial_map.disk import bytes_needed, room_on_disk
 from crossloc3d_ros.aerial_map.progress import Counter, ProgressCallback
 from crossloc3d_ros.aerial_map.store import Manifest
-from crossloc3d_ros.aerial_map.survey import read_survey
+from crossloc3d_ros.aerial_map.survey import Survey, read_survey
 from crossloc3d_ros.aerial_map.tile import TileTimes
 from crossloc3d_ros.aerial_map.tiles import BuiltTiles, TileJob, build_tiles, check_config, continue_or_start
 from crossloc3d_ros.config import BuildConfig
@@ -33,6 +33,7 @@ class BuildReport:
     """What a build came to."""
 
     output: Path
+    survey: Survey
     manifest: Manifest
     resumed: bool
     """Whether an earlier, interrupted build was continued."""
@@ -99,12 +100,15 @@ def build_map(
             publish(work / "result", output)
             writing_s = watch.lap()
         shutil.rmtree(work, ignore_errors=True)
-    return _report(output, manifest, resumed, built, writing_s)
+    return _report(output, survey, manifest, resumed, built, writing_s)
 
 
-def _report(output: Path, manifest: Manifest, resumed: bool, built: BuiltTiles, writing_s: float) -> BuildReport:
+def _report(
+    output: Path, survey: Survey, manifest: Manifest, resumed: bool, built: BuiltTiles, writing_s: float
+) -> BuildReport:
     return BuildReport(
         output=output,
+        survey=survey,
         manifest=manifest,
         resumed=resumed,
         points_read=built.points_read,

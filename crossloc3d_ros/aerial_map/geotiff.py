@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -119,6 +120,29 @@ def _checksum(path: Path, windows: Sequence[Window]) -> int:
         for window in windows:
             checksum = zlib.crc32(file.read(1, window=window).tobytes(), checksum)
     return checksum
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a raster lies."""
+
+    crs: str
+    """Such as EPSG:32631; empty where the file names none."""
+    bounds: Bounds
+    cell_m: float
+
+
+def read_placement(path: Path) -> Placement:
+    """Return where a raster lies, without reading its cells; MapError where it is damaged or lies askew."""
+    try:
+        with rasterio.open(path) as file:
+            transform, box = file.transform, file.bounds
+            if transform.b or transform.d or transform.a != -transform.e:
+                raise MapError(f"the raster {path} lies askew or has cells that are no squares; build the map anew")
+            crs = file.crs.to_string() if file.crs else ""
+            return Placement(crs, (box.left, box.bottom, box.right, box.top), float(transform.a))
+    except RasterioError as error:
+        raise MapError(f"the raster {path} is damaged or missing; copy the map again or build it anew") from error
 
 
 def read_geotiff(path: Path, bounds: Bounds | None = None) -> Raster:

@@ -24,6 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from crossloc3d_ros.aerial_map.calibration import MapCalibration, manifest_digest, read_calibration
+from crossloc3d_ros.aerial_map.consistency import check_echoes, check_placement, check_submaps
 from crossloc3d_ros.aerial_map.coverage import Coverage
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
 from crossloc3d_ros.aerial_map.geotiff import read_geotiff
@@ -31,6 +32,7 @@ from crossloc3d_ros.clouds.raster import Bounds, Raster
 from crossloc3d_ros.config import BuildConfig, PreprocessingConfig, from_dict
 from crossloc3d_ros.errors import ConfigError, MapError
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.placement import DatumAccuracy
 from crossloc3d_ros.types import Float64Array, Int32Array
 
 FORMAT = "crossloc3d map"
@@ -115,6 +117,8 @@ class Manifest:
     software: str
     coverage: Coverage | None = None
     """How densely and how completely the survey covers the map; null in maps that were not asked."""
+    datum: DatumAccuracy | None = None
+    """How well places in the survey's CRS are known in WGS84; null in maps that were not asked."""
     format: str = FORMAT
     format_version: int = FORMAT_VERSION
 
@@ -180,7 +184,7 @@ class AerialMap:
 
     @classmethod
     def load(cls, path: str | Path, encoder_fingerprint: str | None = None) -> AerialMap:
-        """Open a map folder, checking version, checksums and, where given, that this encoder made it.
+        """Open a map folder, checking version, checksums, that it agrees with itself, and, where given, its encoder.
 
         Raises MapError with a sentence that says what to do.
         """
@@ -203,7 +207,18 @@ class AerialMap:
         frame = MapFrame(manifest.crs, np.array(manifest.origin), manifest.geoid_separation_m)
         support = folder / SUPPORT if any(record.name == SUPPORT for record in manifest.files) else None
         rasters = (folder / TERRAIN, folder / SURFACE, folder / LOWEST, support)
-        return cls(folder, manifest, frame, submaps, index, *rasters, *_calibration_of(folder))
+        opened = cls(folder, manifest, frame, submaps, index, *rasters, *_calibration_of(folder))
+        opened._check()
+        return opened
+
+    def _check(self) -> None:
+        """Raise MapError where manifest, rasters and submaps are not of one map."""
+        manifest, grid = self.manifest, self.submaps.grid
+        rasters = [self.terrain_path, self.surface_path, self.lowest_path]
+        rasters += [] if self.support_path is None else [self.support_path]
+        check_placement(self.path, manifest.crs, self.bounds, manifest.build.cell_m, manifest.origin, rasters)
+        check_submaps(self.path, grid, self.bounds, manifest.preprocessing.half_extent_m, self.terrain_path)
+        check_echoes(self.path, grid, self.surface_path, self.lowest_path, self.support_path)
 
 
 def _calibration_of(folder: Path) -> tuple[MapCalibration | None, str]:

@@ -8,8 +8,12 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from crossloc3d_ros.aerial_map.builder import BuildReport, build_map
 from crossloc3d_ros.aerial_map.coverage import SPARSE_PER_M2, Coverage, coverage_warnings
+from crossloc3d_ros.aerial_map.store import Manifest
+from crossloc3d_ros.aerial_map.survey import Survey
 from crossloc3d_ros.cli.common import (
     ProgressDisplay,
     add_options,
@@ -22,6 +26,8 @@ from crossloc3d_ros.cli.common import (
 from crossloc3d_ros.config import BuildConfig, LocalizabilityConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder
 from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.geodesy import MapFrame, crs_name
+from crossloc3d_ros.placement import datum_warnings, datum_words, place_words, unit_name, unit_of
 
 _CALIBRATION_OPTIONS = ("lidar", "lidar_height_m", "places", "off_map_scans", "seed")
 """Of `calibrate_map`; the workers are those of the build."""
@@ -114,7 +120,10 @@ def summary(report: BuildReport) -> str:
     dropped = counts.points_noise + counts.points_withheld + counts.points_stray
     rows = [
         ("map", f"{report.output}{' (an earlier build was continued)' if report.resumed else ''}"),
+        ("place", _place(manifest)),
         ("area", f"{(east - west) / 1e3:.2f} x {(north - south) / 1e3:.2f} km, {manifest.crs}"),
+        ("survey", f"{crs_name(report.survey.crs)}; {_units(report.survey)}"),
+        ("accuracy", datum_words(report.survey.datum)),
         ("points", f"{counts.points_used:,} used, {dropped:,} dropped (noise, withheld, stray)"),
         *_covered(manifest.coverage),
         ("ground", ground),
@@ -129,9 +138,25 @@ def summary(report: BuildReport) -> str:
             f"{report.submaps_encoded:,} submaps in {report.encoding_s:.1f} s, {report.submaps_per_s:,.1f} a second",
         ),
         ("writing", f"{report.writing_s:.1f} s"),
+        *(("warning", text) for text in datum_warnings(report.survey.datum)),
         *(("warning", text) for text in (coverage_warnings(manifest.coverage) if manifest.coverage else ())),
     ]
     return "\n".join(f"{name:<9} {text}" for name, text in rows)
+
+
+def _place(manifest: Manifest) -> str:
+    """Return where the middle of the map is, with a link that shows it."""
+    frame = MapFrame(manifest.crs, np.array(manifest.origin))
+    latitude, longitude, _ = (float(value[0]) for value in frame.to_geographic(np.array([manifest.origin])))
+    at = f"{latitude:.5f}/{longitude:.5f}"
+    link = f"https://www.openstreetmap.org/?mlat={latitude:.5f}&mlon={longitude:.5f}#map=15/{at}"
+    return f"{place_words(latitude, longitude)}, {link}"
+
+
+def _units(survey: Survey) -> str:
+    unit_m = unit_of(survey.crs)
+    horizontal = "degree" if unit_m is None else unit_name(unit_m)
+    return f"unit of x and y: {horizontal}, of heights: {unit_name(survey.vertical.metres_per_unit)}"
 
 
 def _covered(coverage: Coverage | None) -> list[tuple[str, str]]:

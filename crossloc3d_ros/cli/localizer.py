@@ -17,7 +17,8 @@ Localize a LiDAR on an aerial map.
 subscribes  points                           sensor_msgs/PointCloud2
             odom                             nav_msgs/Odometry, where odometry is topic
             imu                              sensor_msgs/Imu, where use_imu or use_imu_heading is set
-            initialpose                      geometry_msgs/PoseWithCovarianceStamped, in `map`, `earth` or a frame of TF
+            initialpose                      geometry_msgs/PoseWithCovarianceStamped, in `map`, `earth`, the odometry's
+                                             frame or one of TF
 publishes   ~/fix                            sensor_msgs/NavSatFix, one for each scan that is processed
             ~/pose                           geometry_msgs/PoseWithCovarianceStamped, latched, only with a fix
             ~/state                          diagnostic_msgs/DiagnosticStatus, latched: searching, ambiguous,

@@ -184,7 +184,8 @@ def _localize(
         try:
             localize_bag(
                 bag, topic, localizer, output, every=arguments.every, imu_topic=arguments.imu_topic,
-                imu_time_constant_s=config.imu_time_constant_s, odometry=odometry, progress=show,
+                imu_time_constant_s=config.imu_time_constant_s, odometry=odometry,
+                base_frame_id=config.base_frame_id or "base_link", progress=show,
             )  # fmt: skip
             let_through()
         except BagError as error:

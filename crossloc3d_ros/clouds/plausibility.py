@@ -37,6 +37,9 @@ _OPPOSITE_RATIO = 4  # opposite of the ground is the sky, opposite of a wall in 
 _LEAST_AROUND = 32  # of the cells nearer than `_FAR_M`; upright or upside down there are at least 42
 _MOST_AROUND = 10  # beside a long wall more is seen of even a narrow path, but by a lidar that is turned of no ground
 
+_COMPARED, _SAME_M, _SAME_SHARE = 512, 1e-3, 0.99
+_FARTHEST_M = 1e6
+
 _WHERE = ("behind it", "ahead of it", "to its right", "to its left")
 """-x, +x, -y, +y of the base frame; the counts of sides begin with -z and +z."""
 
@@ -136,5 +139,25 @@ def _survey(  # type: ignore[no-untyped-def]
 
 
 def same_points(points: npt.NDArray[np.float32], before: npt.NDArray[np.float32]) -> bool:
-    """Return whether two clouds (N, 3) are the same bit for bit: a live lidar never repeats its noise."""
-    return points.shape == before.shape and points.tobytes() == before.tobytes()
+    """Return whether two clouds (N, 3) are the same to a millimetre: a live lidar never repeats its noise.
+
+    It scatters by centimetres, and at rest too hardly a point comes back to where it was. Compared are `_COMPARED`
+    points, alike in which of them are no echo. Of too few echoes nothing is concluded.
+    """
+    if points.shape != before.shape:
+        return False
+    rows = np.linspace(0, len(points) - 1, min(len(points), _COMPARED)).astype(np.int64)
+    now, then = points[rows].astype(np.float64), before[rows].astype(np.float64)
+    is_echo, was_echo = _is_echo(now), _is_echo(then)
+    both = is_echo & was_echo
+    if np.count_nonzero(both) < _LEAST_POINTS:
+        return False
+    same = is_echo == was_echo
+    same[both] = np.abs(now[both] - then[both]).max(axis=1) < _SAME_M
+    return float(np.mean(same)) >= _SAME_SHARE
+
+
+def _is_echo(points: Float64Array) -> npt.NDArray[np.bool_]:
+    """Return which points (N, 3) are echoes: drivers send none as NaN, as the origin, or as far away as can be."""
+    nearness = np.abs(points).max(axis=1)
+    return np.asarray(np.isfinite(nearness) & (nearness > 0.0) & (nearness < _FARTHEST_M))

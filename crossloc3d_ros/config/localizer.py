@@ -118,6 +118,12 @@ class AlignmentConfig:
     descriptor_weight: float = option(
         0.5, "weight of the descriptors' log likelihood ratio beside the alignment's", low=0.0, high=10.0
     )
+    local_map_m: float = option(
+        30.0,
+        "scans of the last metres that are aligned together, along odometry; 0 = each scan by itself",
+        low=0.0,
+        high=200.0,
+    )
     min_cells: int = option(100, "a scan with evidence in fewer cells is not aligned", low=1, high=100_000)
     use_calibration: bool = option(
         True, "shift log likelihoods by the offset that calibrate_map left in the map's folder, where there is one"
@@ -259,6 +265,13 @@ class LocalizerNodeConfig(LocalizerConfig):
     transform_tolerance: float = option(
         0.2, "time by which that transform is stamped ahead of its scan", low=0.0, high=10.0
     )
+
+    def __post_init__(self) -> None:
+        """Refuse frames that tf2 does not know."""
+        for name in ("global_frame_id", "base_frame_id", "odom_frame_id"):
+            frame = getattr(self, name)
+            if frame.startswith("/"):
+                raise ConfigError(f"'{name}' must not begin with a slash, which tf2 refuses: set '{frame.lstrip('/')}'")
 
 
 def usable_threads() -> int:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
@@ -67,6 +68,9 @@ RENAMED = {
 """Settings of version 0.1 under other names: an old name is refused with the new one."""
 
 
+_hints: Callable[[Any], dict[str, Any]] = functools.cache(typing.get_type_hints)
+
+
 def option(default: T, text: str, *, low: float | None = None, high: float | None = None) -> T:
     """Declare a dataclass field with a description and, for numbers, an inclusive range."""
     return field(default=default, metadata={"text": text, "low": low, "high": high})
@@ -82,7 +86,7 @@ def from_dict(kind: type[T], values: Mapping[str, Any], *, where: str = "") -> T
 
     Missing keys keep their defaults. `where` prefixes the names in messages.
     """
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
@@ -174,7 +178,7 @@ class Setting:
 
 def settings_of(kind: type[Any], prefix: str = "") -> Iterator[Setting]:
     """Yield the plain fields of a configuration dataclass and of the groups that it holds."""
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     for item in dataclasses.fields(kind):
         hint = hints[item.name]
         if dataclasses.is_dataclass(hint):

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
+from crossloc3d_ros.clouds.frames import CloudFrames
 from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import DatasetConfig, PreprocessingConfig, ScanConfig
-from crossloc3d_ros.datasets.truth import find_truth_topic
-from crossloc3d_ros.errors import BagError, CloudError
+from crossloc3d_ros.datasets.truth import find_truth_topic, is_fix
+from crossloc3d_ros.errors import BagError, CloudError, PoseError
 from crossloc3d_ros.formats.bag import IMU, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, BagReader, open_bag, stamp_ns_of
+from crossloc3d_ros.formats.odometry import OdometryPoses
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
@@ -173,6 +174,7 @@ def read_scans(
         track, odometry, damage = read_tracks(bag, used["gnss"], used["odometry"], MapFrame(crs, np.zeros(3)))
         total = bag.topic(used["points"], POINT_CLOUD).count
         gravity = GravityFilter(1.0)
+        frames = CloudFrames(scan_config.mounting)
         dropped: Counter[str] = Counter()
         stamps: list[int] = []
         places: list[Float64Array] = []
@@ -193,7 +195,7 @@ def read_scans(
                 if not reason and places and math.dist(place[0], places[-1]) < config.scan_spacing_m:
                     reason = TOO_NEAR
                 if not reason:
-                    patch = _patch(message, stamp_ns, scan_config, preprocessing, gravity.up(stamp_ns))
+                    patch = _patch(message, stamp_ns, scan_config, preprocessing, gravity.up(stamp_ns), frames)
                     if patch is None:
                         reason = UNUSABLE
                     else:
@@ -226,14 +228,18 @@ def read_tracks(
     fixes: list[tuple[int, float, float, float]] = []
     poses: list[tuple[int, float, float, float]] = []
     damage = ""
+    by_topic = OdometryPoses(odometry_topic or "")
     try:
         for name, recorded_ns, message in bag.messages([t for t in (gnss_topic, odometry_topic) if t]):
             stamp_ns = stamp_ns_of(message, recorded_ns)
             if name == gnss_topic:
                 fixes.append((stamp_ns, float(message.latitude), float(message.longitude), _std_m(message)))
             else:
-                pose = message.pose.pose
-                poses.append((stamp_ns, pose.position.x, pose.position.y, _yaw(pose.orientation)))
+                try:
+                    pose = by_topic.pose(message, stamp_ns)
+                except PoseError:
+                    continue
+                poses.append((stamp_ns, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])))
     except BagError as error:
         damage = str(error)
     stamps, first = np.unique(np.array([fix[0] for fix in fixes], np.int64), return_index=True)
@@ -303,10 +309,15 @@ def _position(odometry: OdometryTrack, stamps_ns: Int64Array) -> npt.NDArray[np.
 
 
 def _patch(
-    message: Any, stamp_ns: int, config: ScanConfig, preprocessing: PreprocessingConfig, up: Float64Array | None
+    message: Any,
+    stamp_ns: int,
+    config: ScanConfig,
+    preprocessing: PreprocessingConfig,
+    up: Float64Array | None,
+    frames: CloudFrames,
 ) -> Float32Array | None:
     try:
-        scan = replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns)
+        scan = frames(replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns))
         patch = prepare_scan(scan, config, preprocessing, up).patch
     except CloudError as error:
         log.debug("a cloud is left out: %s", error)
@@ -316,8 +327,7 @@ def _patch(
 
 def _std_m(fix: Any) -> float:
     """Return the larger horizontal standard deviation, NaN without a fix, 0 where the receiver does not say."""
-    usable = fix.status.status >= 0 and abs(fix.latitude) <= 90.0 and abs(fix.longitude) <= 180.0  # false for NaN
-    if not usable:
+    if not is_fix(fix.status.status, fix.latitude, fix.longitude):
         return math.nan
     if fix.position_covariance_type == 0:
         return 0.0
@@ -325,11 +335,3 @@ def _std_m(fix: Any) -> float:
     if not np.isfinite(covariance).all():
         return math.inf
     return float(np.sqrt(max(0.0, np.linalg.eigvalsh((covariance + covariance.T) / 2)[-1])))
-
-
-def _yaw(orientation: Any) -> float:
-    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
-    if not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 1e-6:
-        return math.nan
-    x_axis = Rotation.from_quat(quaternion).apply([1.0, 0.0, 0.0])
-    return math.atan2(x_axis[1], x_axis[0])

@@ -39,7 +39,7 @@ class TruthTrack:
     grid: Float64Array
     """(T, 3) easting, northing, height, metres, the map's grid; heights NaN where the geoid is not known."""
     dropped: int
-    """Fixes left out: no fix, not finite, or a standard deviation above MAX_STD_M."""
+    """Fixes left out: no fix, not finite, at 0, 0, or a standard deviation above MAX_STD_M."""
     std_m: float = float("nan")
     """Median of the larger horizontal standard deviations that the receiver gives; NaN where it gives none."""
 
@@ -97,7 +97,7 @@ def read_truth(bag: BagReader, topic: str, frame: MapFrame) -> TruthTrack:
     try:
         for _, recorded_ns, fix in bag.messages([topic]):
             std_m = _std_m(fix)
-            if not _usable(fix.status.status, fix.latitude, fix.longitude) or std_m > MAX_STD_M:
+            if not is_fix(fix.status.status, fix.latitude, fix.longitude) or std_m > MAX_STD_M:
                 dropped += 1
                 continue
             if fix.position_covariance_type != 0:
@@ -207,9 +207,14 @@ def _turned_rad(xy_m: Float64Array, grid: Float64Array, frame: MapFrame) -> floa
     return float(np.angle(np.sum(measured * np.conj(true))))
 
 
-def _usable(status: int, latitude: float, longitude: float) -> bool:
+def is_fix(status: int, latitude: float, longitude: float) -> bool:
+    """Return whether a NavSatFix holds a place on Earth.
+
+    Exactly 0, 0 is no place: drivers that have no position yet send it, some with STATUS_FIX.
+    """
     finite = math.isfinite(latitude) and math.isfinite(longitude)
-    return status >= 0 and finite and abs(latitude) <= 90.0 and abs(longitude) <= 180.0
+    on_earth = finite and abs(latitude) <= 90.0 and abs(longitude) <= 180.0
+    return status >= 0 and on_earth and not (latitude == 0.0 and longitude == 0.0)
 
 
 def _std_m(fix: object) -> float:

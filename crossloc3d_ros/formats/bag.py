@@ -9,7 +9,7 @@ import logging
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -34,6 +34,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from crossloc3d_ros.errors import BagError
+from crossloc3d_ros.formats.bag_files import contradiction, has_metadata, left_beside, merged, storage_files
 
 log = logging.getLogger(__name__)
 
@@ -101,12 +102,37 @@ class BagReader:
     def __enter__(self) -> Self:
         _check_before_opening(self.path)
         try:
-            # Bags from before Iron hold no message definitions: the standard types are then taken as Jazzy's.
-            reader = AnyReader([self.path], default_typestore=_jazzy())
-            self._reader = self._stack.enter_context(reader)
+            self._reader = self._opened()
         except Exception as error:  # a damaged file makes the library raise nearly anything
+            self._stack.close()
             raise self._damaged(error) from error
         return self
+
+    def _opened(self) -> AnyReader:
+        """Open the recording: by its metadata where they agree with the files, else by the files alone."""
+        files = storage_files(self.path)
+        unmerged = [file for file in files if left_beside(file)]
+        if self.path.is_file() and not unmerged:
+            return self._enter([self.path])
+        if not unmerged:
+            fault = "it is missing, as after a recorder that was stopped" if not has_metadata(self.path) else ""
+            if not fault:
+                try:
+                    reader = self._enter([self.path])
+                    fault = contradiction(reader)
+                except Exception as error:
+                    if not files:
+                        raise
+                    fault = " ".join(str(error).split())
+                if not fault:
+                    return reader
+                self._stack.close()
+            log.warning("%s is left aside, the files are read as they are: %s", self.path / "metadata.yaml", fault)
+        return self._enter([merged(file, self._stack) for file in files])
+
+    def _enter(self, paths: Sequence[Path]) -> AnyReader:
+        # Bags from before Iron hold no message definitions: the standard types are then taken as Jazzy's.
+        return self._stack.enter_context(AnyReader(paths, default_typestore=_jazzy()))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -124,7 +150,7 @@ class BagReader:
                 name=connection.topic,
                 msgtype=connection.msgtype,
                 count=connection.msgcount + (known.count if known else 0),
-                offered_qos_profiles=qos + _offered_qos(connection),
+                offered_qos_profiles=qos + tuple(new for new in _offered_qos(connection) if new not in qos),
             )
         return dict(sorted(found.items()))
 
@@ -227,9 +253,9 @@ class BagReader:
         if self.path.suffix == ".bag":
             advice += ", or repair it with 'rosbag reindex'"
         elif any(".mcap" in file.suffixes for file in files):
-            advice += ", or save what is whole with 'mcap recover' and 'ros2 bag reindex'"
+            advice += ", or save what is whole with 'mcap recover FILE -o NEW.mcap' and give NEW.mcap itself"
         else:
-            advice += ", or save what is whole with sqlite3's '.recover' and 'ros2 bag reindex'"
+            advice += ', or save what is whole with "sqlite3 FILE .recover | sqlite3 NEW.db3" and give NEW.db3 itself'
         detail = str(error).strip().rstrip(".") or type(error).__name__
         return BagError(f"cannot read {names}: {what}{detail}; {advice}")
 
@@ -328,14 +354,8 @@ def _jazzy() -> Typestore:
 def _check_before_opening(path: Path) -> None:
     if not path.exists():
         raise BagError(f"{path} does not exist; give a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 .bag")
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        storages = sorted(p for p in path.iterdir() if p.suffix in {".mcap", ".db3"})
-        if not storages:
-            raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor a .mcap or .db3 file")
-        raise BagError(
-            f"{path / 'metadata.yaml'} is missing, so the recording was not finished; "
-            f"run 'ros2 bag reindex {path}', or give the file itself: {storages[0]}"
-        )
+    if path.is_dir() and not has_metadata(path) and not storage_files(path):
+        raise BagError(f"{path} is not a recording: it holds neither metadata.yaml nor a .mcap or .db3 file")
     if path.is_file() and path.suffix not in {".mcap", ".db3", ".bag"}:
         raise BagError(f"{path} is not a recording; give a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 .bag")
 

@@ -7,25 +7,24 @@ metres of them.
 from __future__ import annotations
 
 import glob as shell_glob
-import logging
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import laspy
 import lazrs  # type: ignore[import-untyped]
 import numpy as np
-from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 
 from crossloc3d_ros.errors import AerialDataError
 from crossloc3d_ros.files import atomic_path
-from crossloc3d_ros.geodesy import crs_text, parse_crs
+from crossloc3d_ros.formats.las_crs import Record, crs_of_records
+from crossloc3d_ros.formats.las_repair import count_note, find_repairs, open_repaired, true_count
+from crossloc3d_ros.geodesy import parse_crs
+from crossloc3d_ros.placement import names_heights, with_vertical
 from crossloc3d_ros.types import AerialChunk, Float64Array, UInt8Array
-
-_log = logging.getLogger(__name__)
 
 SUFFIXES = (".las", ".laz")
 """What counts as an aerial file when a folder is given; COPC files end in .copc.laz."""
@@ -36,10 +35,8 @@ GROUND, LOW_NOISE, HIGH_NOISE = 2, 7, 18
 # laspy and lazrs let the errors of their parts through when a file is damaged; lazrs may also panic.
 _READ_ERRORS = (laspy.errors.LaspyException, lazrs.LazrsError, OSError, EOFError, ValueError, struct.error, MemoryError)
 
-# GeoTIFF keys that hold the CRS in LAS 1.0 to 1.3, and the codes of their vertical units.
-_GEOGRAPHIC_KEY, _PROJECTED_KEY, _VERTICAL_KEY, _VERTICAL_UNITS_KEY = 2048, 3072, 4096, 4099
-_UNIT_METRES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
-_ELLIPSOID_CODES = range(5001, 5034)
+_SAMPLE_PLACES, _SAMPLE_POINTS = 9, 50
+"""Places in a file, and points there, that tell where it lies whatever the box in its header says."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +51,15 @@ class AerialHeader:
     vertical_metres_per_unit: float | None
     """Set where the header names a vertical unit apart from its CRS."""
     minimum: Float64Array
-    """(3,) in the file's units."""
+    """(3,) in the file's units, as the header has it: it may be false."""
     maximum: Float64Array
-    """(3,) in the file's units."""
+    """(3,) in the file's units, as the header has it: it may be false."""
+    metres_per_unit: float | None = None
+    """Of x and y, set where the header names it apart from its CRS."""
+    sample: Float64Array = field(default_factory=lambda: np.empty((0, 3)))
+    """(N, 3) some points, from all over the file, in its units; empty where none could be read."""
+    notes: tuple[str, ...] = ()
+    """What is false in the header and was read around, a sentence each."""
 
 
 def expand_inputs(inputs: Sequence[str | Path]) -> list[Path]:
@@ -86,33 +89,42 @@ def expand_inputs(inputs: Sequence[str | Path]) -> list[Path]:
 
 
 def read_header(path: Path, crs: str | None = None) -> AerialHeader:
-    """Return the header of a file; `crs` replaces the CRS in it.
+    """Return the header of a file; `crs` replaces the CRS in it, but a unit of heights or a vertical CRS that only the
+    file names is kept.
 
     Raises AerialDataError where the file cannot be read, or has no CRS and none is given.
     """
     try:
-        with laspy.open(path) as reader:
-            header = reader.header
-            point_count, minimum, maximum = int(header.point_count), header.mins, header.maxs
-            records = list(header.vlrs.get_by_id("LASF_Projection"))
-            if reader.evlrs is not None:
-                records += reader.evlrs.get_by_id("LASF_Projection")
+        with _open(path, laspy.LazBackend.Lazrs) as opened:
+            header, notes = opened.reader.header, opened.notes
+            point_count, minimum, maximum = opened.point_count, header.mins, header.maxs
+            said = crs_of_records(_projection_records(opened.reader))
+            sample = _sample(opened)
         size_bytes = path.stat().st_size
     except _READ_ERRORS as error:
         raise AerialDataError(f"{path} cannot be read as LAS or LAZ: {_reason(error)}") from error
-    vertical_metres_per_unit: float | None = None
-    if crs is None:
-        crs, vertical_metres_per_unit = _crs_of(path, records)
-    else:
+    vertical_metres_per_unit, metres_per_unit = said.vertical_metres_per_unit, said.metres_per_unit
+    if crs is not None:
         parse_crs(crs)
+        vertical_metres_per_unit, metres_per_unit = said.heights_m, None
+        if said.crs is not None:
+            crs = with_vertical(crs, said.crs)
+        if names_heights(crs):
+            vertical_metres_per_unit = None
+    elif said.crs is None:
+        example = "" if "header" in said.problem else ", for instance --crs EPSG:28992"
+        raise AerialDataError(f"{path} {said.problem}; set it with --crs{example}")
     return AerialHeader(
         path=path,
         point_count=point_count,
         size_bytes=size_bytes,
-        crs=crs,
+        crs=crs or said.crs or "",
         vertical_metres_per_unit=vertical_metres_per_unit,
         minimum=np.array(minimum, dtype=np.float64),
         maximum=np.array(maximum, dtype=np.float64),
+        metres_per_unit=metres_per_unit,
+        sample=sample,
+        notes=notes + said.notes,
     )
 
 
@@ -125,9 +137,9 @@ def iter_chunks(path: Path, chunk_points: int = 1_000_000, *, threads: bool = Tr
     backend = laspy.LazBackend.LazrsParallel if threads else laspy.LazBackend.Lazrs
     read, expected = 0, 0
     try:
-        with laspy.open(path, laz_backend=backend) as reader:
-            expected = int(reader.header.point_count)
-            for record in reader.chunk_iterator(chunk_points):
+        with _open(path, backend) as opened:
+            expected = opened.point_count
+            for record in opened.reader.chunk_iterator(chunk_points):
                 read += len(record)
                 yield _chunk(record)
     except BaseException as error:
@@ -138,6 +150,78 @@ def iter_chunks(path: Path, chunk_points: int = 1_000_000, *, threads: bool = Tr
         ) from error
     if read < expected:
         raise AerialDataError(f"{path} is truncated: it holds {read:,} of {expected:,} points; fetch it again")
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A file opened with what is false in its header read around."""
+
+    reader: laspy.LasReader
+    point_count: int
+    chunks: list[tuple[int, int]] | None
+    """Points and bytes of each chunk of a LAZ file; None where there is no table of them."""
+    notes: tuple[str, ...]
+
+
+@contextmanager
+def _open(path: Path, backend: laspy.LazBackend) -> Iterator[_Opened]:
+    repairs = find_repairs(path)
+    with laspy.open(open_repaired(path, repairs), laz_backend=backend) as reader:
+        chunks, chunk_points = _chunk_table(path, reader)
+        point_count = int(reader.header.point_count)
+        notes: tuple[str, ...] = ()
+        if repairs is not None:
+            point_count = true_count(path, repairs, chunks, chunk_points)
+            note = count_note(repairs, point_count)
+            notes = repairs.notes + ((note,) if note else ())
+        reader.header.point_count = point_count
+        yield _Opened(reader, point_count, chunks, notes)
+
+
+def _chunk_table(path: Path, reader: laspy.LasReader) -> tuple[list[tuple[int, int]] | None, int | None]:
+    """Return points and bytes of each chunk of a LAZ file, and the points of all but the last where they are equal.
+
+    (None, None) where there is no table, as in a file whose writer was stopped; reading says what can be read then.
+    """
+    if not reader.header.are_points_compressed:
+        return None, None
+    try:
+        vlr = lazrs.LazVlr(reader.header.vlrs.get("LasZipVlr")[0].record_data)
+        with path.open("rb") as file:
+            file.seek(reader.header.offset_to_point_data)
+            chunks = [(int(points), int(size)) for points, size in lazrs.read_chunk_table(file, vlr)]
+    except BaseException as error:
+        if not isinstance(error, (*_READ_ERRORS, IndexError)) and type(error).__name__ != "PanicException":
+            raise
+        return None, None
+    return chunks, None if vlr.uses_variable_size_chunks() else int(vlr.chunk_size())
+
+
+def _sample(opened: _Opened) -> Float64Array:
+    """Return some points (N, 3) from all over a file, none where it is damaged: reading it says so."""
+    count = opened.point_count
+    starts = [i * count // _SAMPLE_PLACES for i in range(_SAMPLE_PLACES)]
+    if opened.chunks is not None:
+        # Only the first points of a chunk come without decompressing those before them.
+        edges = np.cumsum([0, *(points for points, _ in opened.chunks[:-1])])
+        chosen = np.linspace(0, len(edges) - 1, min(len(edges), _SAMPLE_PLACES)).astype(int)
+        starts = [int(edges[i]) for i in chosen] if len(edges) >= _SAMPLE_PLACES // 2 else starts[::4]
+    found: list[Float64Array] = [np.empty((0, 3))]
+    try:
+        for start in dict.fromkeys(starts):
+            if start < count:
+                opened.reader.seek(start)
+                record = opened.reader.read_points(_SAMPLE_POINTS)
+                found.append(np.column_stack([np.asarray(record.x), np.asarray(record.y), np.asarray(record.z)]))
+    except BaseException as error:
+        if not isinstance(error, _READ_ERRORS) and type(error).__name__ != "PanicException":
+            raise
+    return np.concatenate(found)
+
+
+def _projection_records(reader: laspy.LasReader) -> list[Record]:
+    records = [*reader.header.vlrs, *(reader.evlrs or ())]
+    return [Record(r.record_id, r.record_data_bytes()) for r in records if r.user_id == "LASF_Projection"]
 
 
 class LazWriter:
@@ -226,46 +310,6 @@ def _chunk(record: Any) -> AerialChunk:
     if withheld.any():
         points, classification = points[~withheld], classification[~withheld]
     return AerialChunk(points, classification)
-
-
-def _crs_of(path: Path, records: list[Any]) -> tuple[str, float | None]:
-    """Return the CRS of a file's records and, where they name one apart, its metres per vertical unit."""
-    for record in records:
-        if isinstance(record, WktCoordinateSystemVlr) and record.string.strip("\0 \n"):
-            try:
-                return crs_text(parse_crs(record.string.strip("\0 \n"))), None
-            except AerialDataError as error:
-                raise AerialDataError(f"the header of {path}: {error}; set it with --crs") from error
-    for record in records:
-        if isinstance(record, GeoKeyDirectoryVlr):
-            return _crs_of_geokeys(path, record)
-    raise AerialDataError(f"{path} names no CRS; set it with --crs, for instance --crs EPSG:28992")
-
-
-def _crs_of_geokeys(path: Path, record: GeoKeyDirectoryVlr) -> tuple[str, float | None]:
-    keys = {int(k.id): int(k.value_offset) for k in record.geo_keys if k.tiff_tag_location == 0}
-    horizontal = next((c for c in (keys.get(_PROJECTED_KEY), keys.get(_GEOGRAPHIC_KEY)) if _is_epsg(c)), None)
-    if horizontal is None or keys.get(_PROJECTED_KEY, 0) == 32767:
-        raise AerialDataError(f"the header of {path} describes a CRS without an EPSG code; set it with --crs")
-    unit = _UNIT_METRES.get(keys.get(_VERTICAL_UNITS_KEY, 0))
-    vertical = keys.get(_VERTICAL_KEY)
-    try:
-        crs = parse_crs(f"EPSG:{horizontal}")
-    except AerialDataError as error:
-        raise AerialDataError(f"the header of {path}: {error}; set it with --crs") from error
-    if vertical is None or not _is_epsg(vertical):
-        return crs_text(crs), unit
-    try:
-        return crs_text(parse_crs(f"EPSG:{horizontal}+{vertical}")), unit
-    except AerialDataError:
-        if vertical in _ELLIPSOID_CODES:
-            return crs_text(crs.to_3d()), unit
-        _log.warning("the vertical CRS %d in the header of %s is unknown and left aside", vertical, path)
-        return crs_text(crs), unit
-
-
-def _is_epsg(code: int | None) -> bool:
-    return code is not None and 1024 <= code <= 32766
 
 
 def _reason(error: BaseException) -> str:

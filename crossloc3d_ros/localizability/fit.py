@@ -56,13 +56,6 @@ def odds_of(aligned: AlignedPoses) -> float:
     return float(np.logaddexp.reduce(log_odds)) if len(log_odds) else -math.inf
 
 
-def log_posterior(offset: float, scans: Sequence[ScanOdds]) -> float:
-    """Return the logarithm of prior and likelihood of an offset, up to a constant."""
-    log_odds, right, weight = _columns(scans)
-    log_null = -np.logaddexp(0.0, log_odds + offset)
-    return float(weight @ (log_null + np.where(right, offset, 0.0)) - 0.5 * (offset / PRIOR_STD) ** 2)
-
-
 def fit_offset(scans: Sequence[ScanOdds]) -> FittedOffset:
     """Return the most probable offset, lowered until no scan off the map is believed above `MOST_OFF_MAP`.
 

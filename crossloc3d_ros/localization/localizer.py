@@ -12,10 +12,13 @@ from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
+from crossloc3d_ros.localization.alignment.evidence import evidence_of
+from crossloc3d_ros.localization.alignment.local_map import LocalMap
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
-from crossloc3d_ros.localization.fusion.odometry import Motion
+from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.fusion.tracker import Tracker
+from crossloc3d_ros.localization.inputs import check_stamp
 from crossloc3d_ros.localization.retrieval.candidates import encode_query, retrieve
 from crossloc3d_ros.localization.retrieval.place_belief import decide, effective_calibration
 from crossloc3d_ros.types import (
@@ -51,6 +54,7 @@ class Localizer:
         self._is_warm = False
         self._tracker = Tracker(config.fusion)
         self._schedule = SearchSchedule(config.alignment)
+        self._local_map = LocalMap(config.alignment.local_map_m)
         self.reconfigure(config)
 
     @property
@@ -83,8 +87,10 @@ class Localizer:
         `gravity_base` (3,) is the unit vector that points up, measured in the base frame, where an IMU gives one;
         `T_base_lidar` (4, 4) replaces the mounting of the configuration, where TF gives it. `motion` leads from the
         last scan that counted (`stamp_ns` of this object) to this one; None = not known. A function is called for it
-        when the descriptor is done: odometry may arrive later than the scan.
+        when the descriptor is done: odometry may arrive later than the scan. CloudError and PoseError for what is none
+        of these; the belief is left as it is.
         """
+        check_stamp(scan.stamp_ns, "the stamp of a scan")
         watch = Watch()
         if T_base_lidar is None:
             T_base_lidar = mounting_matrix(self.config.scan.mounting)
@@ -102,7 +108,7 @@ class Localizer:
         watch.lap("search_ms")
         if self._aligner is None:
             return placed_estimate(scan.stamp_ns, frame, place, candidates, prepared.counts, watch)
-        motion = motion() if callable(motion) else motion
+        motion = self._plausible(scan.stamp_ns, motion() if callable(motion) else motion)
         step = self._within_revolution(scan, motion)
         hypotheses = self._tracker.predict(scan.stamp_ns, motion)
         aligned = moved(self._align(self._aligner, scan.stamp_ns, prepared, T_base_lidar, found, hypotheses), step)
@@ -125,6 +131,7 @@ class Localizer:
         self.calibration = effective_calibration(config.retrieval, self.encoder)
         self._tracker.reconfigure(config.fusion)
         self._schedule.reconfigure(config.alignment)
+        self._local_map.length_m = config.alignment.local_map_m
         if config.alignment.scope == "none":
             self._aligner = None
         elif self._aligner is None:
@@ -138,6 +145,7 @@ class Localizer:
         """Forget every hypothesis: the robot may be anywhere."""
         self._tracker.reset()
         self._schedule.reset()
+        self._local_map.clear()
 
     def warm_up(self) -> None:
         """Run every step once, so that the first scan is as fast as the others.
@@ -174,7 +182,12 @@ class Localizer:
         """Align at the hypotheses; around the candidates and on the whole map when a search is due."""
         config, schedule = self.config.alignment, self._schedule
         sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        alignment = aligner.begin(prepared, sensor_xy, _first(found, config.candidates))
+        newest = evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy)
+        if not self._tracker.skips:
+            motion = self._tracker.motion
+            self._local_map.move(motion.delta if motion.is_known else None)
+            evidence = self._local_map.add(newest)
+        alignment = aligner.begin(evidence, _first(found, config.candidates), newest)
         if alignment is None:
             return no_aligned_poses()
         alignment.refine_hypotheses(hypotheses)
@@ -186,6 +199,12 @@ class Localizer:
                 if not is_enough and schedule.map_due(stamp_ns):
                     alignment.search_map()
         return alignment.result()
+
+    def _plausible(self, stamp_ns: int, motion: Motion | None) -> Motion | None:
+        since_ns = self._tracker.stamp_ns
+        if since_ns is None or stamp_ns <= since_ns:
+            return motion
+        return plausible_motion(motion, (stamp_ns - since_ns) * 1e-9, self.config.fusion)
 
     def _within_revolution(self, scan: Scan, motion: Motion | None) -> Float64Array:
         """Return the motion (3,) from the middle of the lidar's revolution, where the scan is aligned, to its stamp.

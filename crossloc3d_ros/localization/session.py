@@ -20,6 +20,7 @@ from crossloc3d_ros.localization.estimates import no_estimate
 from crossloc3d_ros.localization.fusion.gravity import GravityFilter
 from crossloc3d_ros.localization.fusion.odometry import Motion, OdometryBuffer, ScanOdometry
 from crossloc3d_ros.localization.fusion.priors import PosePrior
+from crossloc3d_ros.localization.inputs import check_stamp
 from crossloc3d_ros.localization.motion_compensation import MotionCompensation, SteadyMotion
 from crossloc3d_ros.localization.scan_checks import ScanChecks
 from crossloc3d_ros.types import Estimate, Float64Array, Scan, TrackState
@@ -28,6 +29,8 @@ OdometryKind = Literal["topic", "scan", "none"]
 """What measures the motion between scans: samples of odometry, the scans themselves by KISS-ICP, or nothing."""
 SAME_CLOCK_NS = 10_000_000_000
 """A prior stamped farther from the next scan was stamped by another clock: it is taken to hold at that scan."""
+LOST_AFTER_NS, LOST_AFTER_SCANS = 1_000_000_000, 10
+"""A robot that was localized is lost when no scan has counted for longer, or so many in a row have not."""
 MAX_HEADING_AGE_NS = 500_000_000
 """An older heading of a compass says nothing about a robot that may have turned since."""
 
@@ -95,7 +98,9 @@ class Session:
         """Start with nothing received; ConfigError where KISS-ICP is needed and not installed."""
         self.localizer = localizer
         self.state = TrackState.SEARCHING
-        """That of the last scan that could change it."""
+        """That of the last scan that counted."""
+        self._counted_ns: int | None = None
+        self._uncounted = 0
         config = localizer.config
         self._gravity = GravityFilter(imu_time_constant_s)
         self._heading: PosePrior | None = None
@@ -109,6 +114,7 @@ class Session:
         """Forget the hypotheses, the priors and what the IMU measured: the robot may be anywhere, in any attitude."""
         self.localizer.reset()
         self.state = TrackState.SEARCHING
+        self._counted_ns, self._uncounted = None, 0
         self._gravity.reset()
         self._heading = None
         self._priors.clear()
@@ -165,6 +171,7 @@ class Session:
         Each scan is received once, in the order of arrival, whether it will be localized or not. `T_base_lidar` (4, 4)
         replaces the mounting of the configuration, `up_base` (3,) the accelerations.
         """
+        check_stamp(scan.stamp_ns, "the stamp of a scan")
         config = self.localizer.config.scan
         mounting = mounting_matrix(config.mounting) if T_base_lidar is None else T_base_lidar
         up = self._gravity.up(scan.stamp_ns) if up_base is None else up_base
@@ -187,6 +194,7 @@ class Session:
         `wait_for_odometry(stamp_ns)` is called when the motion is needed and the odometry of that stamp is missing.
         """
         scan, localizer = received.scan, self.localizer
+        before_ns = localizer.stamp_ns
         if received.fault:
             return self.fault(scan.stamp_ns, received.fault)
 
@@ -206,15 +214,25 @@ class Session:
             estimate = localizer.localize(scan, received.up_base, received.T_base_lidar, motion)
         except CrossLocError as error:
             return self.fault(scan.stamp_ns, str(error))
-        if not len(estimate.candidates) and math.isnan(estimate.probability):
-            # Nothing was compared with the map: what was known before still holds.
-            estimate = replace(estimate, state=self.state)
-        self.state = estimate.state
+        is_compared = len(estimate.candidates) > 0 or not math.isnan(estimate.probability)
+        is_skipped = localizer.stamp_ns is not None and localizer.stamp_ns == before_ns  # late, or a repeated stamp
+        if is_compared and not is_skipped:
+            self.state = estimate.state
+            self._counted_ns, self._uncounted = scan.stamp_ns, 0
+        else:
+            estimate = replace(estimate, state=self._state_without(scan.stamp_ns))
         return Outcome(estimate, within_turn=self._compensation.words)
 
     def fault(self, stamp_ns: int, reason: str) -> Outcome:
-        """Return the outcome of a scan that says nothing: no fix, and the state that it was."""
-        return Outcome(replace(no_estimate(stamp_ns, reason), state=self.state), is_fault=True)
+        """Return the outcome of a scan that says nothing: no fix, and the state as it is known without it."""
+        return Outcome(replace(no_estimate(stamp_ns, reason), state=self._state_without(stamp_ns)), is_fault=True)
+
+    def _state_without(self, stamp_ns: int) -> TrackState:
+        """Return the state after a scan that does not count: for a while what was known before still holds."""
+        self._uncounted += 1
+        since_ns = 0 if self._counted_ns is None else abs(stamp_ns - self._counted_ns)
+        is_long = since_ns > LOST_AFTER_NS or self._uncounted >= LOST_AFTER_SCANS
+        return TrackState.LOST if is_long and self.state is TrackState.LOCALIZED else self.state
 
     def _await_odometry(self, stamp_ns: int, wait: Callable[[int], None] | None) -> None:
         if wait is not None and not self.has_odometry_until(stamp_ns):
@@ -222,10 +240,10 @@ class Session:
 
     def _hand_over_priors(self, received: PreparedInput) -> None:
         stamp_ns = received.scan.stamp_ns
-        for prior in self._priors:
+        priors, self._priors = self._priors, []
+        for prior in priors:
             same_clock = abs(prior.stamp_ns - stamp_ns) < SAME_CLOCK_NS
             self.localizer.set_prior(prior if same_clock else replace(prior, stamp_ns=0))
-        self._priors.clear()
         heading = received.heading
         if heading is None or self.state is TrackState.LOCALIZED:
             return

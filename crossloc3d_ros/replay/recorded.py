@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crossloc3d_ros.clouds.frames import CloudFrames
 from crossloc3d_ros.errors import BagError, CloudError, PoseError
 from crossloc3d_ros.evaluation.drives.estimates import EstimateWriter
 from crossloc3d_ros.formats.bag import IMU, ODOMETRY, POINT_CLOUD, BagReader, stamp_ns_of
-from crossloc3d_ros.formats.odometry import pose_matrix
+from crossloc3d_ros.formats.odometry import OdometryPoses
 from crossloc3d_ros.formats.pointcloud2 import scan_from_pointcloud2
 from crossloc3d_ros.localization.session import OdometryKind, Outcome, PreparedInput, ScanLocalizer, Session
 from crossloc3d_ros.types import Estimate
@@ -66,17 +67,20 @@ def localize_bag(
     imu_topic: str | None = None,
     imu_time_constant_s: float = 1.0,
     odometry: OdometrySource | None = None,
+    base_frame_id: str = "base_link",
     progress: Progress | None = None,
 ) -> int:
     """Localize every `every`-th scan of a bag, write the estimates to the CSV file `output` and return their number.
 
     `imu_topic` levels the scans by accelerations in the axes of the base; `odometry` names what measures the motion
-    between them; None = nothing does. A cloud that cannot be used becomes a row without a fix, with the reason; a bag
-    that breaks off raises BagError when the rows before the break are written.
+    between them; None = nothing does. Clouds of `base_frame_id` are in the base's frame already. A cloud that
+    cannot be used becomes a row without a fix, with the reason; a bag that breaks off raises BagError when the rows
+    before the break are written.
     """
     total = math.ceil(bag.topic(topic, POINT_CLOUD).count / every)
     kind: OdometryKind = "none" if odometry is None else "scan" if odometry.topic is None else "topic"
-    feed = _Feed(Session(localizer, kind, imu_time_constant_s), odometry)
+    frames = CloudFrames(localizer.config.scan.mounting, base_frame_id)
+    feed = _Feed(Session(localizer, kind, imu_time_constant_s), odometry, frames)
     odometry_topic = None if odometry is None else odometry.topic
     done = 0
     with EstimateWriter(output) as writer:
@@ -102,8 +106,10 @@ class _Waiting(NamedTuple):
 class _Feed:
     """Feed a session with the messages of a recording, in the order in which they were recorded."""
 
-    def __init__(self, session: Session, odometry: OdometrySource | None) -> None:
+    def __init__(self, session: Session, odometry: OdometrySource | None, frames: CloudFrames) -> None:
         self._session = session
+        self._frames = frames
+        self._poses = OdometryPoses((odometry.topic if odometry else None) or "odometry")
         self._source = odometry
         self._warned = False
         self._within_turn = ""
@@ -124,14 +130,15 @@ class _Feed:
             log.warning("'%s' gives the pose of '%s'; it is taken for '%s'", self._source.topic, child, base)
             self._warned = True
         try:
-            self._session.add_odometry(stamp_ns_of(message, recorded_ns), pose_matrix(message.pose.pose))
+            stamp_ns = stamp_ns_of(message, recorded_ns)
+            self._session.add_odometry(stamp_ns, self._poses.pose(message, stamp_ns))
         except PoseError as error:
             log.debug("odometry left out: %s", error)
 
     def take_cloud(self, message: Any, recorded_ns: int) -> _Waiting:
         stamp_ns = stamp_ns_of(message, recorded_ns)
         try:
-            scan = replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns)
+            scan = self._frames(replace(scan_from_pointcloud2(message), stamp_ns=stamp_ns))
             return _Waiting(stamp_ns, recorded_ns, self._session.receive(scan))
         except CloudError as error:
             return _Waiting(stamp_ns, recorded_ns, error)

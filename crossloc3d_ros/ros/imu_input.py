@@ -15,7 +15,7 @@ from crossloc3d_ros.errors import CrossLocError, PoseError
 from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.gravity import is_gravity
 from crossloc3d_ros.localization.fusion.priors import PosePrior
-from crossloc3d_ros.ros.poses import heading_prior, stamp_of
+from crossloc3d_ros.ros.poses import frame_of, heading_prior, stamp_of
 from crossloc3d_ros.ros.subscriptions import REPEAT_REASON_S, subscribe
 from crossloc3d_ros.types import Float64Array
 
@@ -62,7 +62,7 @@ class ImuInput:
         try:
             R_base_imu = np.eye(3)
             if self._pose_on_base is not None:
-                R_base_imu = self._pose_on_base(message.header.frame_id)[:3, :3]
+                R_base_imu = self._pose_on_base(frame_of(message.header.frame_id))[:3, :3]
             self._take_acceleration(message, R_base_imu)
             self._take_heading(message, R_base_imu)
         except CrossLocError as error:

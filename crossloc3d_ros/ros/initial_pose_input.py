@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.errors import ConfigError, PoseError
 from crossloc3d_ros.localization.fusion.priors import PosePrior
-from crossloc3d_ros.ros.poses import EARTH_FRAME_ID, initial_pose, stamp_of
+from crossloc3d_ros.ros.poses import EARTH_FRAME_ID, frame_of, initial_pose, stamp_of
 from crossloc3d_ros.ros.subscriptions import subscribe
 from crossloc3d_ros.ros.transforms import TransformSource
 from crossloc3d_ros.types import Float64Array
@@ -37,10 +37,12 @@ class InitialPoseInput:
         base_frame_id: str,
         on_prior: Callable[[PosePrior], None],
         why_unused: Callable[[], str] = lambda: "",
+        pose_of_odom: Callable[[str], Float64Array | None] = lambda frame_id: None,
     ) -> None:
         """Call `on_prior` with each initial pose that can be used; the others are logged as errors, with the reason.
 
-        `why_unused` returns why none can be used at present, or an empty text.
+        `why_unused` returns why none can be used at present, or an empty text. `pose_of_odom(frame_id)` returns
+        `T_map_odom` (4, 4) as this node knows it; None for another frame, and before the first fix.
         """
         self._node = node
         self._map = aerial_map
@@ -48,6 +50,7 @@ class InitialPoseInput:
         self._base_frame_id = base_frame_id
         self._on_prior = on_prior
         self._why_unused = why_unused
+        self._pose_of_odom = pose_of_odom
         # Its own, and only once a pose needs it: the mounting of the lidar has nothing to do with it.
         self._transforms: TransformSource | None = None
         self._timer: Any = None
@@ -73,7 +76,8 @@ class InitialPoseInput:
     def take(self, message: PoseWithCovarianceStamped) -> None:
         """Take in an initial pose; a newer one replaces one that still waits for TF."""
         self._stop_waiting()
-        frame_id, unused = message.header.frame_id, self._why_unused()
+        frame_id, unused = frame_of(message.header.frame_id), self._why_unused()
+        T_map_odom = self._pose_of_odom(frame_id)
         if unused:
             self._refuse(unused)
         elif frame_id == self._global_frame_id:
@@ -82,17 +86,18 @@ class InitialPoseInput:
             self._accept(message, np.asarray(np.linalg.inv(self._map.frame.pose_on_earth)))
         elif not frame_id:
             self._refuse("it names no frame")
+        elif T_map_odom is not None:
+            self._accept(message, T_map_odom)
         else:
-            self._look_up(message)
+            self._look_up(message, frame_id)
 
-    def _look_up(self, message: PoseWithCovarianceStamped) -> None:
-        frame_id = message.header.frame_id
+    def _look_up(self, message: PoseWithCovarianceStamped, frame_id: str) -> None:
         try:
             source = self._transforms = self._transforms or TransformSource(self._node, self._base_frame_id)
         except ConfigError:
             self._refuse(
-                f"it is given in '{frame_id}': without tf2_ros only '{self._global_frame_id}' and "
-                f"'{EARTH_FRAME_ID}' can be used"
+                f"it is given in '{frame_id}': without tf2_ros only '{self._global_frame_id}', '{EARTH_FRAME_ID}' and, "
+                "after a fix, the frame of the odometry can be used"
             )
             return
         deadline = time.monotonic() + TF_TIMEOUT_S

@@ -14,6 +14,7 @@ from sensor_msgs.msg import PointCloud2
 
 from crossloc3d_ros.errors import CrossLocError
 from crossloc3d_ros.ros.diagnostics import Statistics
+from crossloc3d_ros.ros.poses import frame_of
 from crossloc3d_ros.ros.subscriptions import subscribe
 from crossloc3d_ros.types import Float64Array
 
@@ -75,7 +76,7 @@ class LidarInput:
         T_base_lidar, fault = None, ""
         if self._pose_on_base is not None:
             try:
-                T_base_lidar = self._pose_on_base(message.header.frame_id)
+                T_base_lidar = self._pose_on_base(frame_of(message.header.frame_id))
             except CrossLocError as error:
                 fault = str(error)
         self._statistics.dropped(self._offer(Arrival(message, time.monotonic(), T_base_lidar, fault)))

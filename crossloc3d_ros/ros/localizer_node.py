@@ -226,10 +226,10 @@ class LocalizerNode(LifecycleNode):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set the parameters, all or none; a refusal names the parameter and the reason."""
         try:
-            admitted = self._configuration.admit(parameter_list)
+            changes = self._configuration.admit(parameter_list)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        return super().set_parameters_atomically(admitted)
+        return super().set_parameters_atomically(changes) if changes else SetParametersResult(successful=True)
 
     def _why_fixed(self, name: str) -> str | None:
         if name == "autostart":

@@ -49,6 +49,7 @@ class Localizing:
     def reset(self) -> None:
         """Localize anew: forget all but the odometry."""
         self._session.reset()
+        self._outputs.forget_odometry()
         self._last_status = None
 
     def reconfigure(self, config: LocalizerConfig) -> None:

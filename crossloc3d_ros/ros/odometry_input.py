@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from crossloc3d_ros.errors import CrossLocError, PoseError
 from crossloc3d_ros.formats.odometry import pose_matrix
-from crossloc3d_ros.ros.poses import stamp_of
+from crossloc3d_ros.ros.poses import frame_of, stamp_of
 from crossloc3d_ros.ros.subscriptions import REPEAT_REASON_S, subscribe
 from crossloc3d_ros.types import Float64Array
 
@@ -90,7 +90,8 @@ class OdometryInput:
     def take(self, message: Odometry) -> None:
         """Take in a message; PoseError where it cannot be used."""
         try:
-            sample = OdometrySample(stamp_of(message), self._base_pose(message), message.header.frame_id)
+            frame = frame_of(message.header.frame_id)
+            sample = OdometrySample(stamp_of(message), self._base_pose(message, frame), frame)
         except CrossLocError as error:
             self._complaint = str(error)
             raise
@@ -127,8 +128,8 @@ class OdometryInput:
             if add(sample):
                 return
 
-    def _base_pose(self, message: Odometry) -> Float64Array:
-        frame, child = message.header.frame_id, message.child_frame_id
+    def _base_pose(self, message: Odometry, frame: str) -> Float64Array:
+        child = frame_of(message.child_frame_id)
         if self._odom_frame_id not in ("", frame):
             raise PoseError(
                 f"it is given in '{frame}', not in '{self._odom_frame_id}': set odom_frame_id to '{frame}', or to '' "

@@ -55,6 +55,8 @@ class Outputs:
         """Announce the topics and publish the map's origin; `transform` where TF is to be published too."""
         self._node, self._config, self._frame, self._status_name = node, config, frame, status_name
         self._transform = transform
+        self._odometry: tuple[str, Float64Array | None] = "", None
+        """The odometry's frame, and its pose in the map."""
         self._publishers: dict[str, Any] = {
             "fix": node.create_lifecycle_publisher(NavSatFix, "~/fix", 10),
             "pose": node.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", LATCHED),
@@ -73,11 +75,12 @@ class Outputs:
     def publish(self, estimate: Estimate, T_odom_base: Float64Array | None, odom_frame_id: str) -> None:
         """Publish an estimate; `T_odom_base` (4, 4) is the odometry's pose at its stamp, None where it is not known."""
         config, publishers = self._config, self._publishers
+        if estimate.status is FixStatus.FIX:  # first: whoever has seen the fix may give a pose relative to it
+            self._place_odometry(estimate, T_odom_base, odom_frame_id)
         publishers["fix"].publish(fix_message(estimate, config.base_frame_id))
         publishers["state"].publish(state_message(estimate, self._status_name))
         if estimate.status is FixStatus.FIX:
             publishers["pose"].publish(pose_message(estimate, config.global_frame_id))
-            self._publish_transform(estimate, T_odom_base, odom_frame_id)
         for name, make in _ON_DEMAND.items():
             if publishers[name].get_subscription_count() > 0:
                 publishers[name].publish(make(estimate, self._frame, config.global_frame_id))
@@ -92,11 +95,22 @@ class Outputs:
             self._node.destroy_lifecycle_publisher(publisher)
         self._node.destroy_publisher(self._origin_publisher)
 
-    def _publish_transform(self, estimate: Estimate, T_odom_base: Float64Array | None, odom_frame_id: str) -> None:
-        """Publish the odometry's frame in the map (REP-105) while localized."""
-        if self._transform is None or estimate.state is not TrackState.LOCALIZED:
+    def pose_of_odom(self, frame_id: str) -> Float64Array | None:
+        """Return `T_map_odom` (4, 4) by the last fix; None for another frame than the odometry's, and before a fix."""
+        known, T_map_odom = self._odometry  # one assignment in the worker's thread: both are of one scan
+        return T_map_odom if frame_id == known else None
+
+    def forget_odometry(self) -> None:
+        """Forget where the odometry's frame lies in the map."""
+        self._odometry = "", None
+
+    def _place_odometry(self, estimate: Estimate, T_odom_base: Float64Array | None, odom_frame_id: str) -> None:
+        """Note where the odometry's frame lies in the map while localized, and publish it (REP-105)."""
+        if estimate.state is not TrackState.LOCALIZED:
             return
         if odom_frame_id in ("", self._config.global_frame_id):
+            if self._transform is None:
+                return
             self._node.get_logger().warning(
                 f"no transform is published: the odometry names '{odom_frame_id}' as its frame, which must be one of "
                 "its own (REP-105)",
@@ -106,4 +120,6 @@ class Outputs:
         if T_odom_base is None or not np.isfinite(estimate.T_map_base).all():
             return
         T_map_odom = estimate.T_map_base @ np.linalg.inv(T_odom_base)
-        self._transform.send(estimate.stamp_ns, T_map_odom, odom_frame_id)
+        self._odometry = odom_frame_id, T_map_odom
+        if self._transform is not None:
+            self._transform.send(estimate.stamp_ns, T_map_odom, odom_frame_id)

@@ -16,6 +16,7 @@ from crossloc3d_ros.errors import ConfigError
 T = TypeVar("T")
 
 _EVERY_NODES_OWN = ("use_sim_time", "start_type_description_service")
+_QOS = "qos_overrides."
 _CLIENT_LIBRARYS_TOPICS = ("/clock", "/parameter_events", "/rosout")
 
 
@@ -71,48 +72,67 @@ class ConfigParameters(Generic[T]):
     @property
     def config(self) -> T:
         """Return the configuration that the parameters' values make; raises ConfigError."""
-        return from_dict(self._kind, _nested({name: self._value(name) for name in self._settings}))
+        return self._with([])
 
     def admit(self, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Return the parameters as they can be set, integers converted to the floats that they are meant to be.
+        """Return those parameters that change anything, integers converted to the floats that they are meant to be.
 
-        Raises ConfigError that names what is unknown or wrong; rclpy's own message leaves the name out.
+        Of a name that comes twice the last value counts. Raises ConfigError that names what is unknown or wrong, alone
+        or beside the values of the others; rclpy's own message leaves the name out.
         """
         for parameter in parameters:
-            if parameter.name not in self._settings and not self._node.has_parameter(parameter.name):
+            if not self._node.has_parameter(parameter.name):
                 raise ConfigError(self._unknown(parameter.name))
-        return [self._admit(parameter) for parameter in parameters]
+        last = {parameter.name: parameter for parameter in parameters}
+        changes = [change for change in map(self._change, last.values()) if change is not None]
+        self._with(changes)
+        return changes
 
-    def _admit(self, parameter: Parameter) -> Parameter:
-        setting = self._settings.get(parameter.name)
-        if setting is None:
-            return parameter
-        reason = self._why_fixed(parameter.name)
+    def _change(self, parameter: Parameter) -> Parameter | None:
+        """Return the parameter as it can be set; None where it has this value already, which is no change."""
+        name, setting = parameter.name, self._settings.get(parameter.name)
+        if setting is not None:
+            value = check_value(name, setting.hint, _plain(parameter.value), setting.metadata)
+            parameter = Parameter(name, value=_ros(value))
+        held = self._node.get_parameter(name)
+        if parameter.type_ == held.type_ and _plain(parameter.value) == _plain(held.value):
+            return None
+        if parameter.type_ != held.type_:  # only of those that are no settings
+            raise ConfigError(f"'{name}' must be of type {held.type_.name.lower()}, got {parameter.type_.name.lower()}")
+        reason = self._why_fixed(name) if setting is not None else None
         if reason is not None:
-            raise ConfigError(f"'{parameter.name}' {reason}")
-        value = check_value(parameter.name, setting.hint, _plain(parameter.value), setting.metadata)
-        return Parameter(parameter.name, value=_ros(value))
+            raise ConfigError(f"'{name}' {reason}")
+        return parameter
+
+    def _with(self, changes: Sequence[Parameter]) -> T:
+        """Return the configuration after some changes; ConfigError where values contradict each other."""
+        new = {change.name: _plain(change.value) for change in changes}
+        return self._made_of({name: new[name] if name in new else self._value(name) for name in self._settings})
+
+    def _made_of(self, values: Mapping[str, Any]) -> T:
+        return from_dict(self._kind, _nested(values))
 
     def _overrides(self) -> dict[str, Any]:
         given = {name: self._value(name) for name in self._node.list_parameters([], 0).names}
-        unknown = [name for name in given if name not in self._settings and not self._is_ros_own(name)]
+        others = [name for name in given if name not in self._settings and name not in _EVERY_NODES_OWN]
+        unknown = [name for name in others if not name.startswith(_QOS)]
         if unknown:
             raise ConfigError("; ".join(self._unknown(name) for name in unknown))
+        # The dump of a node with other remaps holds such; this one has nothing that they could mean.
+        idle = [n for n in others if n.startswith(_QOS) and not any(n.startswith(f"{_QOS}{t}.") for t in self._topics)]
+        for name in idle:
+            self._node.undeclare_parameter(name)
+        if idle:
+            self._node.get_logger().warning(f"of no effect: {'; '.join(self._unknown(name) for name in idle)}")
         return {name: value for name, value in given.items() if name in self._settings}
 
-    def _is_ros_own(self, name: str) -> bool:
-        if name in _EVERY_NODES_OWN:
-            return True
-        return any(name.startswith(f"qos_overrides.{topic}.") for topic in self._topics)
-
     def _unknown(self, name: str) -> str:
-        known = list(self._settings)
-        if name.startswith("qos_overrides."):
+        if name.startswith(_QOS):
             return f"unknown parameter '{name}': QoS can be overridden for {', '.join(self._topics)}"
-        return unknown_setting(name, known, "parameter")
+        return unknown_setting(name, list(self._settings), "parameter")
 
     def _declare(self, overrides: Mapping[str, Any]) -> None:
-        from_dict(self._kind, _nested(overrides))
+        self._made_of(overrides)
         for name, setting in self._settings.items():
             value = setting.default
             if name in overrides:
@@ -127,9 +147,7 @@ class ConfigParameters(Generic[T]):
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         # Called for declarations too, of parameters that do not exist yet.
         try:
-            new = {parameter.name: parameter.value for parameter in map(self._admit, parameters)}
-            values = {name: _plain(new[name]) if name in new else self._value(name) for name in self._settings}
-            from_dict(self._kind, _nested(values))  # settings that contradict each other are refused together
+            self.admit([parameter for parameter in parameters if self._node.has_parameter(parameter.name)])
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -122,7 +122,13 @@ def assemble(
         odometry=odometry,
         imu=ImuInput(config, frame, on_acceleration, on_heading, pose_on_base),
         initial_pose=InitialPoseInput(
-            node, localizer.aerial_map, config.global_frame_id, config.base_frame_id, on_prior, why_no_prior
+            node,
+            localizer.aerial_map,
+            config.global_frame_id,
+            config.base_frame_id,
+            on_prior,
+            why_no_prior,
+            outputs.pose_of_odom,
         ),
         outputs=outputs,
         localizing=localizing,

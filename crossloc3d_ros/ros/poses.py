@@ -31,6 +31,11 @@ LEVEL_COSINE = 0.5
 """A base is upright within 60 degrees; what lies flatter follows another convention of axes."""
 
 
+def frame_of(frame_id: str) -> str:
+    """Return the name of a frame as tf2 has it: without the leading slash that nodes of ROS 1 gave it."""
+    return frame_id.lstrip("/")
+
+
 def stamp_of(message: Odometry | Imu) -> int:
     """Return the stamp of a message's header in nanoseconds."""
     return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)

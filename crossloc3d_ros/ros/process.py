@@ -70,7 +70,7 @@ def run_localizer(arguments: Sequence[str], load: Callable[[LocalizerNodeConfig]
         logging.getLogger("crossloc3d_ros").propagate = False
         executor.add_node(node)
         while not node.failure:
-            executor.spin_once(timeout_sec=SPIN_S)
+            _spin_once(executor, node)
     except KeyboardInterrupt:
         code = 0
     finally:
@@ -78,6 +78,16 @@ def run_localizer(arguments: Sequence[str], load: Callable[[LocalizerNodeConfig]
             # A thread that hangs in compiled code makes the interpreter crash at exit; everything else is shut down.
             os._exit(code)
     return code
+
+
+def _spin_once(executor: SingleThreadedExecutor, node: LocalizerNode) -> None:
+    """Run one callback, if there is one; what it raises costs that message or call, not the node."""
+    try:
+        executor.spin_once(timeout_sec=SPIN_S)
+    except Exception as error:
+        if not rclpy.ok():
+            raise
+        node.get_logger().error(f"a message or call was left unanswered: {type(error).__name__}: {error}")
 
 
 def _shut_down(executor: SingleThreadedExecutor, node: LocalizerNode | None, handler: logging.Handler | None) -> bool:

@@ -22,10 +22,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from crossloc3d_ros.aerial_map.survey import read_survey as survey_headers
 from crossloc3d_ros.clouds.raster import Raster, fill_holes, surface_raster, terrain_raster
 from crossloc3d_ros.errors import AerialDataError
-from crossloc3d_ros.formats.las import expand_inputs, iter_chunks, read_header
-from crossloc3d_ros.geodesy import Projection, crs_text, utm_crs_of
+from crossloc3d_ros.formats.las import iter_chunks
+from crossloc3d_ros.geodesy import Projection
 from crossloc3d_ros.simulation import mesh
 from crossloc3d_ros.simulation.scene import Label
 from crossloc3d_ros.simulation.world import Bounds, World, free_space
@@ -146,16 +147,13 @@ def world_from_points(
 def _read(
     paths: Sequence[str | Path], crs: str | None, progress: Callable[[str, float, float, str], None] | None
 ) -> tuple[Float64Array, UInt8Array, str]:
-    """Return all points in the UTM zone of the first file, their classes, and the zone."""
-    headers = [read_header(path, crs) for path in expand_inputs(paths)]
-    total = sum(header.point_count for header in headers)
-    middle = (headers[0].minimum + headers[0].maximum) / 2
-    target = crs_text(utm_crs_of(headers[0].crs, float(middle[0]), float(middle[1])))
+    """Return all points in the UTM zone of the survey, their classes, and the zone."""
+    survey = survey_headers(paths, crs)
     points: list[Float64Array] = []
     classes: list[UInt8Array] = []
     done = 0
-    for header in headers:
-        to_grid = Projection(header.crs, target, header.vertical_metres_per_unit)
+    for header in survey.headers:
+        to_grid = Projection(header.crs, survey.map_crs, header.vertical_metres_per_unit)
         for chunk in iter_chunks(header.path):
             done += len(chunk.points)
             projected = to_grid(chunk.points)
@@ -163,10 +161,10 @@ def _read(
             points.append(projected[usable])
             classes.append(chunk.classification[usable])
             if progress is not None:
-                progress("reading", done, total, "points")
+                progress("reading", done, survey.points, "points")
     if sum(len(part) for part in points) == 0:
-        raise AerialDataError(f"{headers[0].path} holds no usable point")
-    return np.concatenate(points), np.concatenate(classes), target
+        raise AerialDataError(f"{survey.headers[0].path} holds no usable point")
+    return np.concatenate(points), np.concatenate(classes), survey.map_crs
 
 
 def _snap(low: Float64Array, high: Float64Array) -> tuple[float, float, float, float]:

@@ -25,12 +25,10 @@ from scipy.optimize import minimize
 
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.angles import wrap
-from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
-from crossloc3d_ros.config import AlignmentConfig, PreprocessingConfig, ScanConfig
-from crossloc3d_ros.datasets.raw_scans import RawScan
+from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.localization.alignment.aligner import Aligner
-from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evidence, evidence_of
+from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evidence
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
 from crossloc3d_ros.localization.alignment.observation_model import (
     CLASSES,
@@ -41,6 +39,7 @@ from crossloc3d_ros.localization.alignment.observation_model import (
     ObservationModel,
     fit_log_ratios,
 )
+from crossloc3d_ros.training.queries import Query
 from crossloc3d_ros.types import AlignedPoses, BoolArray, Float64Array, Int64Array, no_candidates
 
 RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
@@ -51,21 +50,21 @@ NEAR_M = 10.0
 _OTHERS = 8  # wrong poses that the evidence of each scan is counted at
 _POSES = 16  # of each scan that the weights are fitted to: the worse ones decide nothing
 _RIDGE = 0.01  # of the standardized weights: measures that say the same share their weight
-_INITIAL = (5.0, 8.0, 5.0, -3.0)  # weights before any are learned, for the order of the poses alone
+_INITIAL = (6.0, 7.0, 5.0, 4.0, 4.0, -3.0)  # weights before any are learned, for the order of the poses alone
 
 Progress = Callable[[str, float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class LearningSet:
-    """A map, and scans that were taken on it and off it."""
+    """A map, and queries that were taken on it and off it: scans, and local maps of several."""
 
     name: str
     fold: str
     """Sets of one fold show the same places."""
     map_folder: Path
-    on_map: Sequence[RawScan]
-    off_map: Sequence[RawScan] = ()
+    on_map: Sequence[Query]
+    off_map: Sequence[Query] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +100,8 @@ def fit_alignment(
         model = _model(_sum(others), np.array(_INITIAL))
         for each in of_fold:
             with closing(Aligner(AerialMap.load(each.map_folder), config or AlignmentConfig(), model)) as aligner:
-                for scan, on_map in _scans(each):
-                    poses = _measured_poses(each.name, aligner, scan, on_map)
+                for query, on_map in _queries(each):
+                    poses = _measured_poses(each.name, aligner, query, on_map)
                     measured += [] if poses is None else [poses]
                     done += 1
                     report("aligning", done, total, "scans")
@@ -147,20 +146,15 @@ def fit_weights(measured: Sequence[MeasuredPoses]) -> Float64Array:
     return np.append(weights, found[-1] - weights @ middle)
 
 
-def prepared_of(scan: RawScan) -> PreparedScan:
-    """Return a raw scan as the localizer prepares it."""
-    return prepare_scan(scan.as_scan(), ScanConfig(), PreprocessingConfig(), scan.up_base, scan.T_base_lidar)
-
-
-def is_right(aligned: AlignedPoses, scan: RawScan) -> BoolArray:
-    """Return which aligned poses (p,) are those of the scan."""
+def is_right(aligned: AlignedPoses, query: Query) -> BoolArray:
+    """Return which aligned poses (p,) are those of the query."""
     return np.asarray(
-        (_away(aligned, scan) <= RIGHT_M) & (np.abs(wrap(aligned.heading_rad - scan.heading_rad)) <= RIGHT_RAD)
+        (_away(aligned, query) <= RIGHT_M) & (np.abs(wrap(aligned.heading_rad - query.heading_rad)) <= RIGHT_RAD)
     )
 
 
-def _away(aligned: AlignedPoses, scan: RawScan) -> Float64Array:
-    return np.asarray(np.hypot(*(aligned.grid[:, :2] - scan.T_grid_base[:2, 3]).T))
+def _away(aligned: AlignedPoses, query: Query) -> Float64Array:
+    return np.asarray(np.hypot(*(aligned.grid[:, :2] - query.T_grid_base[:2, 3]).T))
 
 
 def _right_rows(some: Sequence[MeasuredPoses]) -> BoolArray:
@@ -180,9 +174,9 @@ def _by_fold(sets: Sequence[LearningSet]) -> dict[str, list[LearningSet]]:
     return folds
 
 
-def _scans(learned: LearningSet) -> Iterator[tuple[RawScan, bool]]:
-    yield from ((scan, True) for scan in learned.on_map)
-    yield from ((scan, False) for scan in learned.off_map)
+def _queries(learned: LearningSet) -> Iterator[tuple[Query, bool]]:
+    yield from ((query, True) for query in learned.on_map)
+    yield from ((query, False) for query in learned.off_map)
 
 
 def _sum(counts: Iterable[Float64Array]) -> Float64Array:
@@ -207,10 +201,9 @@ def _seen_by_fold(sets: Sequence[LearningSet], report: Progress) -> Mapping[str,
         seen = np.zeros((2, CHANNELS, CLASSES))
         others = _places(likelihood)
         rng = np.random.default_rng(0)
-        for scan in each.on_map:
-            prepared, T = prepared_of(scan), scan.T_base_lidar
-            evidence = evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
-            true = np.append(scan.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], scan.heading_rad)
+        for query in each.on_map:
+            evidence = query.evidence
+            true = np.append(query.T_grid_base[:2, 3] - [likelihood.west_m, likelihood.south_m], query.heading_rad)
             _lay(evidence, likelihood, true, seen[0])
             # A map without open ground says nothing of other places.
             for place in others[rng.integers(0, len(others), _OTHERS)] if len(others) else others:
@@ -250,10 +243,9 @@ def _lay(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Array, coun
     np.add.at(counts, (evidence.channel[inside], likelihood.classes[y[inside], x[inside]]), 1.0)
 
 
-def _measured_poses(name: str, aligner: Aligner, scan: RawScan, on_map: bool) -> MeasuredPoses | None:
-    """Search the whole map for one scan; None where it cannot be aligned."""
-    prepared, T = prepared_of(scan), scan.T_base_lidar
-    alignment = aligner.begin(prepared, (float(T[0, 3]), float(T[1, 3])), no_candidates())
+def _measured_poses(name: str, aligner: Aligner, query: Query, on_map: bool) -> MeasuredPoses | None:
+    """Search the whole map for one query; None where it cannot be aligned."""
+    alignment = aligner.begin(query.evidence, no_candidates())
     if alignment is None:
         return None
     alignment.search_map()
@@ -261,8 +253,8 @@ def _measured_poses(name: str, aligner: Aligner, scan: RawScan, on_map: bool) ->
     kept: Int64Array = np.arange(len(aligned))
     right = np.empty(0, np.int64)
     if on_map:
-        is_its = is_right(aligned, scan)
-        kept = np.flatnonzero(is_its | (_away(aligned, scan) >= NEAR_M))
+        is_its = is_right(aligned, query)
+        kept = np.flatnonzero(is_its | (_away(aligned, query) >= NEAR_M))
         right = np.flatnonzero(is_its[kept])
         kept = np.delete(kept, right[1:])  # one pose of the robot is enough
     if len(right) and right[0] >= _POSES:

@@ -2,50 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.datasets.belief_sets import BeliefSet, BeliefSets, are_apart
-from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training.alignment import LearningSet
+from crossloc3d_ros.training.queries import Query, local_maps, query_of
 
 _FOLDS_OF_TOWNS = 2  # simulated towns of one set: half of them teach what the other half is weighed by
-_SCANS = 60  # of a set and fold on its map: neighbours along a street say much the same
-_STRANGERS = 120  # on each map, from off it: what is wrong has more ways to be so than what is right
+_QUERIES = 40  # of each kind, of a set and fold, on its map: neighbours along a street say much the same
+_STRANGERS = 60  # of each kind on each map, from off it: what is wrong has more ways to be so than what is right
+
+_Kinds = tuple[list[Query], ...]
+"""Single scans, and local maps."""
 
 
 def learning_sets(sets: BeliefSets, seed: int = 0) -> list[LearningSet]:
     """Return the sets that an alignment is learned from: every set on its map, and strangers on every map.
 
-    Strangers are drawn from the scans of all places that are off a map. Sets of one pose set are one fold, or two where
-    it has several areas; real surveys that lie beside each other are one fold. TrainingError for a set that is kept for
-    evaluation.
+    Of each set single scans and local maps count alike. Strangers are drawn from the queries of all places that are off
+    a map. Sets of one pose set are one fold, or two where it has several areas; real surveys that lie beside each other
+    are one fold. TrainingError for a set that is kept for evaluation.
     """
     kept = [each.name for each in sets.on_map if not each.is_learned]
     kept += [each.name for each in sets.maps if not each.is_learned]
     if kept:
         raise TrainingError(f"'{kept[0]}' is kept for evaluation: learn from the pose set 'fitting' and other surveys")
     rng = np.random.default_rng(seed)
-    regions = _regions(sets)
+    regions, queries = _regions(sets), _queries(sets)
     learned = []
     for each in sets.on_map:
         map_folder = each.pose_set.map_folder
-        strangers = _strangers(sets, map_folder)
-        for fold, scans in _folds(each, regions[map_folder]):
+        strangers = _strangers(sets, queries, map_folder)
+        for fold, of_fold in _folds(each, queries[_key(each)], regions[map_folder]):
             name = f"{each.name}, {each.condition.name}"
             learned.append(
-                LearningSet(name, fold, map_folder, _some(scans, _SCANS, rng), _some(strangers, _STRANGERS, rng))
+                LearningSet(name, fold, map_folder, _some(of_fold, _QUERIES, rng), _some(strangers, _STRANGERS, rng))
             )
     known = {each.pose_set.map_folder for each in sets.on_map}
     for other in sets.maps:
         if other.folder not in known:
-            strangers = _some(_strangers(sets, other.folder), _STRANGERS, rng)
-            learned.append(LearningSet(other.name, regions[other.folder], other.folder, (), strangers))
+            strangers = _strangers(sets, queries, other.folder)
+            learned.append(
+                LearningSet(other.name, regions[other.folder], other.folder, (), _some(strangers, _STRANGERS, rng))
+            )
     return learned
+
+
+def _key(each: BeliefSet) -> tuple[Path, int, float]:
+    """Return what the queries of a set depend on: not on the density of its map."""
+    return each.pose_set.folder, each.condition.every_point, each.condition.max_range_m
+
+
+def _queries(sets: BeliefSets) -> Mapping[tuple[Path, int, float], _Kinds]:
+    length_m = AlignmentConfig().local_map_m
+    found: dict[tuple[Path, int, float], _Kinds] = {}
+    for each in sets.on_map:
+        seen = each.condition.seen
+        if _key(each) not in found:
+            singles = [query_of(seen(scan)) for scan in each.pose_set.scans]
+            along = [query for drive in each.drives for query in local_maps(drive, map(seen, drive.scans), length_m)]
+            found[_key(each)] = singles, along
+    return found
 
 
 def _regions(sets: BeliefSets) -> dict[Path, str]:
@@ -70,30 +93,34 @@ def _touch(one: AerialMap, other: AerialMap) -> bool:
     return not are_apart(other, one, corners)
 
 
-def _folds(each: BeliefSet, region: str) -> Iterator[tuple[str, list[RawScan]]]:
-    pose_set = each.pose_set
-    on_map = [each.condition.seen(scan) for scan in pose_set.scans if pose_set.on_map[scan.area]]
-    folds = _FOLDS_OF_TOWNS if sum(pose_set.on_map) > 1 else 1
+def _folds(each: BeliefSet, queries: _Kinds, region: str) -> Iterator[tuple[str, _Kinds]]:
+    on_map = each.pose_set.on_map
+    folds = _FOLDS_OF_TOWNS if sum(on_map) > 1 else 1
     for fold in range(folds):
         name = f"{region} {fold}" if folds > 1 else region
-        yield name, [scan for scan in on_map if scan.area % folds == fold]
+        yield name, tuple([q for q in kind if on_map[q.area] and q.area % folds == fold] for kind in queries)
 
 
-def _strangers(sets: BeliefSets, map_folder: Path) -> list[RawScan]:
-    """Return the scans, under all conditions, of areas that lie off a map."""
+def _strangers(sets: BeliefSets, queries: Mapping[tuple[Path, int, float], _Kinds], map_folder: Path) -> _Kinds:
+    """Return the queries, under all conditions, of areas that lie off a map."""
     aerial_map = AerialMap.load(map_folder)
-    scans = []
-    for each in sets.on_map:
-        pose_set = each.pose_set
-        frame_map = AerialMap.load(pose_set.map_folder)
-        for area in range(len(pose_set.on_map)):
-            rows = np.flatnonzero(pose_set.scans.area == area)
-            if len(rows) and are_apart(aerial_map, frame_map, pose_set.scans.T_grid_base[rows]):
-                scans += [each.condition.seen(pose_set.scans[int(row)]) for row in rows]
-    return scans
+    strangers: _Kinds = ([], [])
+    for each in {_key(each): each for each in sets.on_map}.values():
+        frame_map = AerialMap.load(each.pose_set.map_folder)
+        kinds = queries[_key(each)]
+        for area in range(len(each.pose_set.on_map)):
+            chosen = [[query for query in kind if query.area == area] for kind in kinds]
+            poses = np.array([query.T_grid_base for kind in chosen for query in kind])
+            if len(poses) and are_apart(aerial_map, frame_map, poses):
+                for kind, some in zip(strangers, chosen, strict=True):
+                    kind += some
+    return strangers
 
 
-def _some(scans: Sequence[RawScan], most: int, rng: np.random.Generator) -> list[RawScan]:
-    if len(scans) <= most:
-        return list(scans)
-    return [scans[i] for i in sorted(rng.choice(len(scans), most, replace=False).tolist())]
+def _some(kinds: _Kinds, most: int, rng: np.random.Generator) -> list[Query]:
+    """Return at most so many queries of each kind."""
+    chosen: list[Query] = []
+    for kind in kinds:
+        rows = range(len(kind)) if len(kind) <= most else sorted(rng.choice(len(kind), most, replace=False).tolist())
+        chosen += [kind[i] for i in rows]
+    return chosen

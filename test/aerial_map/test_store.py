@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -13,9 +14,14 @@ import pytest
 
 from crossloc3d_ros.aerial_map import store
 from crossloc3d_ros.aerial_map.builder import build_map
+from crossloc3d_ros.aerial_map.geotiff import BLOCK, read_geotiff, write_geotiff
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import BuildConfig
 from crossloc3d_ros.errors import MapError
+
+CRS = "EPSG:32631"
+ECHOES = (store.SURFACE, store.LOWEST, store.SUPPORT)
+RASTERS = (store.TERRAIN, *ECHOES)
 
 
 @pytest.fixture(scope="module")
@@ -132,15 +138,68 @@ def test_a_truncated_manifest_is_named(folder: Path, content: str) -> None:
         AerialMap.load(folder)
 
 
-def test_a_map_that_disagrees_with_itself_is_refused(folder: Path) -> None:
+def record_anew(folder: Path) -> None:
+    """Write the checksums of the files as they are, as whoever edits a map by hand does."""
+    manifest = store.read_manifest(folder)
+    store.write_manifest(folder, dataclasses.replace(manifest, files=store.file_records(folder)))
+
+
+def without_the_last_submap(folder: Path) -> None:
+    np.save(folder / store.SUBMAPS, np.load(folder / store.SUBMAPS)[:-1])
+
+
+def moved_submaps(folder: Path, **metres: float) -> None:
     rows = np.load(folder / store.SUBMAPS)
-    np.save(folder / store.SUBMAPS, rows[:-1])
+    for column, distance in metres.items():
+        rows[column] += distance
+    np.save(folder / store.SUBMAPS, rows)
 
-    def agree(values: dict[str, Any]) -> None:
-        record = next(f for f in values["files"] if f["name"] == store.SUBMAPS)
-        file = folder / store.SUBMAPS
-        record.update(size_bytes=file.stat().st_size, sha256=store.sha256(file))
 
-    change_manifest(folder, agree)
-    with pytest.raises(MapError, match="does not agree with itself"):
+def another_zone(folder: Path) -> None:
+    change_manifest(folder, lambda values: values.update(crs="EPSG:32632"))
+
+
+def another_origin(folder: Path) -> None:
+    change_manifest(folder, lambda values: values.update(origin=[628_000.0, 580_300.0, 3.0]))
+
+
+def other_bounds(folder: Path) -> None:
+    change_manifest(folder, lambda values: values.update(bounds=[v + 19.0 for v in values["bounds"]]))
+
+
+def rewritten(folder: Path, name: str, *, cells: int = 0, metres: float = 0.0, crs: str = CRS) -> None:
+    """Shift the cells of a raster, or the whole raster, or name another CRS."""
+    raster, kind = read_geotiff(folder / name), "counts" if name == store.SUPPORT else "heights"
+    values = np.roll(raster.values, cells, axis=1)
+    height, width = values.shape
+    west, north = raster.west_m + metres, raster.north_m
+    bounds = (west, north - height * raster.cell_m, west + width * raster.cell_m, north)
+
+    def block(part: tuple[float, float, float, float]) -> np.ndarray:
+        row, column = round((north - part[3]) / raster.cell_m), round((part[0] - west) / raster.cell_m)
+        return values[row : row + BLOCK, column : column + BLOCK]
+
+    write_geotiff(folder / name, bounds, raster.cell_m, crs, block, name, kind)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without_the_last_submap, "submaps and .* descriptors"),
+        (another_zone, r"by its manifest it lies in EPSG:32632, by terrain\.tif in EPSG:32631"),
+        (another_origin, "its origin 628000, 580300 lies .* km off"),
+        (other_bounds, r"by its manifest it covers .*, by terrain\.tif"),
+        (lambda folder: moved_submaps(folder, easting=500_000.0), "submaps lie outside of the area"),
+        (lambda folder: moved_submaps(folder, northing=300.0), "submaps lie outside of the area"),
+        (lambda folder: moved_submaps(folder, ground_height=44.0), r"another ground height than terrain\.tif"),
+        *((lambda folder, name=name: rewritten(folder, name, metres=3.0), rf"by {name}") for name in RASTERS),
+        *((lambda folder, name=name: rewritten(folder, name, crs="EPSG:28992"), "in EPSG:28992") for name in RASTERS),
+        *((lambda f, name=name: rewritten(f, name, cells=3), "are not of the same echoes") for name in ECHOES),
+        (lambda folder: rewritten(folder, store.SURFACE, cells=40), "are not of the same echoes"),
+    ],
+)  # fmt: skip
+def test_a_map_that_disagrees_with_itself_is_refused(folder: Path, change: Callable[[Path], None], words: str) -> None:
+    change(folder)
+    record_anew(folder)
+    with pytest.raises(MapError, match=f"does not agree with itself: .*{words}.*; (copy|build)"):
         AerialMap.load(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -154,11 +155,25 @@ def test_real_scans_are_plausible(shared: Callable[[str], Any], bag: str) -> Non
     assert {implausible(scan_from_pointcloud2(cloud).points, UPRIGHT, CONFIG) for cloud in clouds} == {""}
 
 
-def test_points_are_the_same_bit_for_bit_only() -> None:
-    points = np.random.default_rng(0).random((1000, 3), np.float32)
+def test_points_are_the_same_to_a_millimetre() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-50, 50, (1000, 3)).astype(np.float32)
     points[::10] = np.nan
     assert same_points(points, points.copy())
-    other = points.copy()
-    other[1, 2] = np.nextafter(other[1, 2], np.float32(2.0))
-    assert not same_points(points, other)
+    assert same_points(points, points + rng.normal(0, 1e-5, points.shape).astype(np.float32))
+    assert not same_points(points, points + rng.normal(0, 0.01, points.shape).astype(np.float32))
     assert not same_points(points, points[:-1])
+    assert not same_points(points, np.where(np.arange(1000)[:, None] % 5, points, np.float32(np.nan)))
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, np.inf, 1e30])
+def test_of_clouds_without_echoes_nothing_is_concluded(value: float) -> None:
+    points = np.full((1000, 3), value, np.float32)
+    assert not same_points(points, points.copy())
+
+
+@pytest.mark.parametrize("bag", BAGS)
+def test_real_scans_one_after_the_other_are_not_the_same(shared: Callable[[str], Any], bag: str) -> None:
+    with open_bag(shared(f"data/vlp16/{bag}")) as reader:
+        clouds = [scan_from_pointcloud2(r.message).points for r in reader.messages(["/velodyne_points"])]
+    assert not any(same_points(one, other) for one, other in itertools.pairwise(clouds))

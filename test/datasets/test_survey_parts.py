@@ -89,8 +89,9 @@ def yard(crs: str, folder: Path, classes: tuple[int, int], noise: int = 7) -> tu
     z = 100.0 + np.where(is_hut, 3.5, 0.0) + rng.normal(0, 0.02, len(xy))
     kinds = np.where(is_hut, classes[1], classes[0]).astype(np.uint8)
     kinds[:40], z[:40] = noise, 96.0
-    points = np.column_stack([xy + np.array([628_000.0, 5_803_000.0]), z])
-    points = Projection("EPSG:32631", crs)(points)
+    # Feet are used in the USA, and a survey outside of its CRS's area of use is refused.
+    zone, corner = ("EPSG:32610", (420_000, 4_500_000)) if crs == "EPSG:2225" else ("EPSG:32631", (628_000, 5_803_000))
+    points = Projection(zone, crs)(np.column_stack([xy + np.array(corner), z]))
     path = folder / "yard.laz"
     write_laz(path, points, kinds, crs, scale=1e-8 if crs == "EPSG:4326" else 0.001)
     return path, ~is_hut & (kinds != noise)

@@ -57,8 +57,9 @@ def fix_at(seconds: float, easting: float, std_m: float | None = 1.0, **options:
 
 
 def test_a_track_comes_back_on_the_grid_and_doubtful_fixes_are_left_out(tmp_path: Path) -> None:
-    broken = fix_at(4, 628_740.0)
+    broken, null_island = fix_at(4, 628_740.0), fix_at(6, 628_760.0, std_m=None)
     broken.latitude = float("nan")
+    null_island.latitude = null_island.longitude = 0.0  # with STATUS_FIX, as drivers send it that have none yet
     fixes = [
         (0, fix_at(0, 628_700.0)),
         (1, fix_at(1, 628_710.0, std_m=9.9)),
@@ -66,12 +67,13 @@ def test_a_track_comes_back_on_the_grid_and_doubtful_fixes_are_left_out(tmp_path
         (3, fix_at(3, 629_900.0, has_fix=False)),
         (4, broken),
         (5, fix_at(5, 628_750.0, std_m=None)),
+        (6, null_island),
     ]
     with bag.open_bag(write_gnss(tmp_path / "drive", fixes)) as reader:
         truth = read_truth(reader, "/gnss", FRAME)
     np.testing.assert_allclose(truth.grid[:, 0], [628_700.0, 628_710.0, 628_750.0], atol=1e-3)
     np.testing.assert_allclose(truth.grid[:, 2], 3.0, atol=1e-3)
-    assert (len(truth), truth.dropped) == (3, 3)
+    assert (len(truth), truth.dropped) == (3, 4)
 
 
 def test_fixes_out_of_order_and_repeated_are_put_in_order(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -245,19 +247,92 @@ def test_unfinished_missing_and_foreign_paths_say_what_to_do(tmp_path: Path) -> 
     (tmp_path / "empty").mkdir()
     with pytest.raises(BagError, match=r"neither metadata\.yaml nor"):
         read_everything(tmp_path / "empty")
-    path = write_bag(tmp_path / "drive")
-    (path / "metadata.yaml").unlink()
-    with pytest.raises(BagError, match=r"metadata\.yaml is missing.*ros2 bag reindex.*drive\.mcap"):
-        read_everything(path)
-    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
-    with pytest.raises(BagError, match="cannot read"):
-        read_everything(path)
-    (path / "metadata.yaml").write_text("")
-    with pytest.raises(BagError, match="cannot read"):
-        read_everything(path)
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(BagError, match=r"notes\.txt is not a recording"):
         read_everything(tmp_path / "notes.txt")
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda text: None, "missing"),
+        (lambda text: "", "Invalid bag metadata"),
+        (lambda text: text[: len(text) // 2], ""),
+        (lambda text: text.replace("depth: 5", "depth: 7"), "QoS of /velodyne_points"),
+        (lambda text: text.replace("name: /gnss", "name: /other"), "does not name the topic /gnss"),
+        (
+            lambda text: text.replace("  message_count: 12", "  message_count: 6"),
+            "counts 6 messages, the files hold 12",
+        ),
+    ],
+)
+def test_metadata_that_are_false_lose_no_message(
+    tmp_path: Path, storage: bag.Storage, change: Callable[[str], str | None], reason: str, caplog
+) -> None:
+    path = write_bag(tmp_path / "drive", storage)
+    file = path / "metadata.yaml"
+    text = file.read_text()
+    changed = change(text)
+    assert changed != text
+    if changed is None:
+        file.unlink()
+    else:
+        file.write_text(changed)
+    with bag.open_bag(path) as reader:
+        assert {name: topic.count for name, topic in reader.topics().items()} == {"/gnss": 6, "/velodyne_points": 6}
+        assert reader.topics()["/velodyne_points"].offered_qos_profiles == (
+            bag.OfferedQos("best_effort", "volatile", 5),
+        )
+        assert len(list(reader.messages())) == len(list(reader.raw_messages())) == reader.message_count == 12
+    assert "metadata.yaml is left aside" in caplog.text
+    assert reason in caplog.text
+
+
+def test_sound_metadata_are_followed_without_a_word(tmp_path: Path, caplog) -> None:
+    assert read_everything(write_bag(tmp_path / "drive")) == 12
+    assert not caplog.records
+
+
+def test_a_damaged_file_beside_broken_metadata_is_the_one_that_is_blamed(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "drive")
+    (path / "metadata.yaml").write_text("")
+    (path / "drive.mcap").write_bytes((path / "drive.mcap").read_bytes()[:-200])
+    with pytest.raises(BagError, match=r"cannot read .*drive\.mcap: .*mcap recover") as caught:
+        read_everything(path)
+    assert "reindex" not in str(caught.value)  # that would write metadata over those that may be saved
+
+
+@pytest.mark.parametrize("in_folder", [False, True])
+def test_messages_that_sqlite_has_not_merged_are_read(tmp_path: Path, in_folder: bool, caplog) -> None:
+    path = write_bag(tmp_path / "drive", "sqlite3")
+    (whole,) = path.glob("*.db3")
+    live = tmp_path / "live"
+    live.mkdir()
+    database, source = sqlite3.connect(live / "live.db3"), sqlite3.connect(whole)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("PRAGMA wal_autocheckpoint=0")
+    statements = [line for line in source.iterdump() if not line.startswith(("BEGIN", "COMMIT"))]
+    late = [line for line in statements if line.startswith('INSERT INTO "messages"')][6:]
+    for line in (line for line in statements if line not in late):
+        database.execute(line)
+    database.commit()
+    database.execute("PRAGMA wal_checkpoint(FULL)")
+    for line in late:
+        database.execute(line)
+    database.commit()
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for name in ("live.db3", "live.db3-wal"):
+        (killed / name).write_bytes((live / name).read_bytes())
+    source.close()
+    database.close()
+    before = {file.name: file.read_bytes() for file in killed.iterdir()}
+    with bag.open_bag(killed if in_folder else killed / "live.db3") as reader:
+        assert {name: topic.count for name, topic in reader.topics().items()} == {"/gnss": 6, "/velodyne_points": 6}
+        assert len(list(reader.messages())) == 12
+    assert "live.db3-wal is merged" in caplog.text
+    assert {file.name: file.read_bytes() for file in killed.iterdir()} == before
 
 
 def test_an_interrupted_writer_leaves_nothing(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_the_page_needs_nothing_else_and_says_what_was_done(calibrated: Any) -> 
     assert "src=" not in page.replace('src="data:', "")
     for words in ("at once", "within 20 m", "within 100 m", "not within 100 m", "Twin streets", "N ↑", "vlp-16"):
         assert words in page
-    assert page.count('<title>') == 1 + len(calibrated.found.places)
+    assert page.count("<title>") == 1 + len(calibrated.found.places)
 
 
 def test_a_calibration_of_a_map_that_was_built_again_is_left_aside(calibrated: Any, tmp_path: Path) -> None:

@@ -371,7 +371,7 @@ def on_its_side(points: Float32Array) -> Float32Array:
         (upside_down, "the lidar is upside down: the ground lies above it"),
         (on_its_side, "turned by 90 degrees in pitch: the ground stands upright ahead of it"),
         (covered, "the lidar is covered or blocked"),
-        (None, "the lidar is frozen: it has repeated one scan"),
+        (None, "the lidar is frozen: it repeats a scan of"),
     ],
 )
 def test_what_is_wrong_with_the_lidar_is_named(ride: Ride, change: Change | None, words: str) -> None:

@@ -30,6 +30,7 @@ from crossloc3d_ros.geodesy import MapFrame
 from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.localizer import Localizer, SearchSchedule
 from crossloc3d_ros.simulation.vlp16 import Vlp16
+from crossloc3d_ros.training.queries import query_of
 from crossloc3d_ros.types import Estimate, FixStatus, Scan, TrackState
 
 Float32 = npt.NDArray[np.float32]
@@ -298,6 +299,25 @@ def test_a_drive_leads_to_a_fix_and_being_carried_away_ends_it(town: tuple[PoseS
     assert estimate.status is FixStatus.NO_FIX
     assert estimate.probability < 0.9
     assert estimate.reason
+
+
+def test_the_scans_of_the_last_metres_are_aligned_together(town: tuple[PoseSet, AerialMap, Any]) -> None:
+    """Each of them alone holds too little evidence."""
+    pose_set = town[0]
+    scans = drive(pose_set, pose_set.scans[4], np.arange(-12.0, 6.0, 2.0))
+    cells = max(len(query_of(scan).channel) for scan in scans)
+    ahead = Motion(np.array([2.0, 0.0, 0.0]), np.diag([0.05, 0.05, 0.01]) ** 2)
+    found = {}
+    for length_m in (0.0, 30.0):
+        localizer = in_town(town, scope="map", min_cells=cells + 1, local_map_m=length_m)
+        estimates = [
+            seen(localizer, scan, STAMP_NS + i * 4_000_000_000, ahead if i else None) for i, scan in enumerate(scans)
+        ]
+        found[length_m] = [len(estimate.aligned) for estimate in estimates]
+    assert not any(found[0.0])
+    assert not any(found[30.0][:1]) and all(found[30.0][2:])
+    away = np.hypot(*(estimates[-1].aligned.grid[0] - scans[-1].T_grid_base[:3, 3])[:2])
+    assert away < 1.0, "from the newest scan's own evidence"
 
 
 def upside_down(scan: RawScan) -> RawScan:

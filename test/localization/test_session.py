@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.config import FusionConfig, LocalizerConfig, MountingConfig, ScanConfig
-from crossloc3d_ros.errors import CloudError
+from crossloc3d_ros.errors import CloudError, PoseError
 from crossloc3d_ros.localization.fusion.odometry import Motion
 from crossloc3d_ros.localization.fusion.priors import PosePrior
 from crossloc3d_ros.localization.localizer import no_estimate
@@ -85,8 +85,8 @@ def room(x_m: float = 0.0, near: bool = False) -> np.ndarray:
 
 def scan_at(number: int, points: np.ndarray | None = None) -> Scan:
     seen = room() if points is None else points
-    # A lidar that repeats a scan bit for bit is frozen.
-    return Scan(seen + np.float32(1e-5 * number), START_NS + number * STEP_NS, "velodyne")
+    # A lidar that repeats a scan is frozen.
+    return Scan(seen + np.float32(2e-3 * number), START_NS + number * STEP_NS, "velodyne")
 
 
 def pose(x_m: float) -> np.ndarray:
@@ -264,7 +264,7 @@ def test_what_is_wrong_with_the_lidar_is_a_fault_that_never_reaches_the_localize
     session = Session(listener, "topic")
     for i in range(30):
         session.add_odometry(START_NS + i * STEP_NS, pose(0.2 * i))
-    good = localize(session, scan_at(0, ground(False)))
+    good = localize(session, scan_at(0, ground(False) * np.float32(0.99)))
     assert not good.is_fault
     outcomes = [localize(session, scan_at(i, ground(True))) for i in (1, 2)]
     frozen = [localize(session, Scan(ground(False), START_NS + i * STEP_NS, "velodyne")) for i in (3, 4, 5)]
@@ -276,6 +276,70 @@ def test_what_is_wrong_with_the_lidar_is_a_fault_that_never_reaches_the_localize
     assert listener.stamp_ns == START_NS + 3 * STEP_NS, "the first of the repeated scans is a scan"
     localize(session, scan_at(6, ground(False)))
     assert listener.stamp_ns == START_NS + 6 * STEP_NS
+
+
+def known(number: int, how: str) -> Scan:
+    """A scan that counts, or one that does not."""
+    if how == "unreadable":
+        return dataclasses.replace(scan_at(number), points=np.empty((0, 3), np.float32))
+    return scan_at(number)
+
+
+@pytest.mark.parametrize("how", ["unreadable", "says nothing", "of the same stamp", "refused before"])
+def test_a_robot_is_lost_when_no_scan_has_counted_for_a_second_and_found_by_the_next_that_does(how: str) -> None:
+    listener = Listener()
+    listener.state = TrackState.LOCALIZED
+    session = Session(listener)
+    assert localize(session, scan_at(0)).estimate.state is TrackState.LOCALIZED
+    listener.finds_candidates = how != "says nothing"
+    states = []
+    for i in range(1, 14):
+        if how == "refused before":
+            outcome = session.fault(scan_at(i).stamp_ns, "no pose of the lidar")
+        elif how == "of the same stamp":
+            outcome = localize(session, dataclasses.replace(scan_at(i), stamp_ns=START_NS))
+        else:
+            outcome = localize(session, known(i, how))
+        states.append(outcome.estimate.state)
+    assert states[:9] == [TrackState.LOCALIZED] * 9, "for a while what was known before still holds"
+    assert states[10:] == [TrackState.LOST] * 3
+    listener.finds_candidates = True
+    assert localize(session, scan_at(20)).estimate.state is TrackState.LOCALIZED
+    assert session.fault(scan_at(21).stamp_ns, "").estimate.state is TrackState.LOCALIZED
+
+
+def test_a_prior_that_is_refused_is_refused_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Listener()
+    session = Session(listener)
+
+    def refuse(prior: PosePrior) -> None:
+        raise PoseError("not this one")
+
+    monkeypatch.setattr(listener, "set_prior", refuse)
+    session.add_prior(PosePrior(np.zeros(3), 0.0, np.eye(3), 0))
+    assert localize(session, scan_at(0)).is_fault
+    assert not localize(session, scan_at(1)).is_fault
+
+
+@pytest.mark.parametrize("sample", [[0.0, 0.0, 0.0, 9.81], [9.81], [[0.0, 0.0, 9.81]]])
+def test_an_acceleration_of_another_shape_is_none_and_spoils_nothing(sample: Any) -> None:
+    listener = Listener()
+    session = Session(listener)
+    assert not session.add_acceleration(START_NS, np.array(sample))
+    assert session.add_acceleration(START_NS, np.array([0.0, 0.0, 9.81]))
+    assert not localize(session, scan_at(0)).is_fault
+
+
+@pytest.mark.parametrize("stamp_ns", [float("nan"), None, 1.0])
+def test_a_stamp_that_is_none_is_refused_and_spoils_nothing(stamp_ns: Any) -> None:
+    session = Session(Listener(), "topic")
+    with pytest.raises(PoseError, match="the stamp of a scan must be an integer"):
+        session.receive(dataclasses.replace(scan_at(0), stamp_ns=stamp_ns))
+    with pytest.raises(PoseError, match="the stamp of an odometry pose"):
+        session.add_odometry(stamp_ns, pose(0.0))
+    for i in range(3):
+        assert session.add_odometry(START_NS + i * STEP_NS, pose(0.1 * i))
+    assert not localize(session, scan_at(1)).is_fault
 
 
 def test_a_scan_with_times_waits_for_the_motion_of_its_turn_and_comes_at_the_moment_of_its_stamp() -> None:

@@ -305,3 +305,18 @@ def test_poses_are_held_against_the_true_ones_of_the_recording(town_map: AerialM
     assert summary["track"]["searches"][0]["cause"] == "from nothing"
     write_report(tmp_path / "page.html", evaluation, town_map, About("A drive", {}))
     assert "0.30 m" in (tmp_path / "page.html").read_text()
+
+
+def test_clouds_of_a_second_lidar_are_rows_with_its_name(tmp_path: Path) -> None:
+    recorded: list[tuple[str, str, int, Any]] = []
+    for i in range(6):
+        message = cloud(START + i * SECOND // 2)
+        message.header.frame_id = "rear" if i % 2 else "front"
+        recorded.append(("/points", bag.POINT_CLOUD, START + i * SECOND // 2, message))
+    path = record(tmp_path / "two", recorded)
+    listener = Listener()
+    with bag.open_bag(path) as reader:
+        localize_bag(reader, "/points", listener, tmp_path / "e.csv")
+    assert listener.stamps_ns == [START, START + SECOND, START + 2 * SECOND]
+    reasons = read_estimates(tmp_path / "e.csv").reasons
+    assert [("'front' and 'rear'" in reason) for reason in reasons] == [False, True] * 3

@@ -129,6 +129,13 @@ class World:
         return float(latitude[0]), float(longitude[0])
 
 
+def bare_ground(part: tuple[float, float, float, float]) -> npt.NDArray[np.float32]:
+    """Heights (H, W) of cells of a metre, row 0 in the north: around each place that of the place."""
+    east, north = np.arange(part[0], part[2]) + 0.5, np.arange(part[3], part[1], -1.0) - 0.5
+    column, row = (east - ORIGIN[0] + 60.0) // 120.0, (north - ORIGIN[1] + 60.0) // 120.0
+    return np.asarray(ORIGIN[2] + 0.5 * (6 * row[:, None] + column[None]), dtype=np.float32)
+
+
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     import torch
@@ -155,9 +162,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     DescriptorMap(descriptors).save(map_path / store.DESCRIPTORS)
     rows = np.array([(*World.grid(place), 1024) for place in range(PLACES)], dtype=store.SUBMAP_DTYPE)
     np.save(map_path / store.SUBMAPS, rows)
-    bounds = (ORIGIN[0], ORIGIN[1], ORIGIN[0] + 20, ORIGIN[1] + 20)
+    bounds = (ORIGIN[0] - 60.0, ORIGIN[1] - 60.0, ORIGIN[0] + 660.0, ORIGIN[1] + 540.0)
     for name in (store.TERRAIN, store.SURFACE, store.LOWEST):
-        write_geotiff(map_path / name, bounds, 1.0, CRS, lambda b: np.zeros((20, 20), np.float32), name)
+        write_geotiff(map_path / name, bounds, 1.0, CRS, bare_ground, name)
     manifest = store.Manifest(
         crs=CRS, origin=ORIGIN, bounds=bounds, vertical_reference="ellipsoid", geoid_separation_m=0.0,
         encoder_fingerprint=encoder.fingerprint, descriptor_size=encoder.descriptor_size, preprocessing=preprocessing,

@@ -50,7 +50,7 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "launch.substitutions": {"LaunchConfiguration": Argument},
         "launch_ros": {},
         "launch_ros.actions": {"LifecycleNode": Recorder},
-        "ament_index_python.packages": {"get_package_share_directory": lambda package: f"/share/{package}"},
+        "ament_index_python.packages": {"get_package_share_directory": lambda package: str(REPOSITORY)},
     }
     for name, members in parts.items():
         module = types.ModuleType(name)
@@ -74,10 +74,35 @@ def test_arguments_reach_the_node_and_parameters_that_exist(launch_file: dict[st
     )
     assert {("points", "/lidar"), ("odom", "/wheels"), ("initialpose", "/initialpose")} <= set(node["remappings"])
     file, settings = node["parameters"]
-    assert file == "/share/crossloc3d_ros/config/localizer.yaml"
+    assert file == str(REPOSITORY / "config" / "localizer.yaml")
     assert settings == {"map": "/maps/a", "use_sim_time": True, "autostart": False}
     from_dict(LocalizerNodeConfig, {k: v for k, v in settings.items() if k != "use_sim_time"})
 
 
-def test_what_is_not_given_stays_as_the_file_has_it(launch_file: dict[str, Any]) -> None:
-    assert started_with(launch_file, params_file="/mine.yaml")["parameters"] == ["/mine.yaml", {}]
+def test_what_is_not_given_stays_as_the_file_has_it(launch_file: dict[str, Any], tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("")
+    assert started_with(launch_file, params_file=str(mine))["parameters"] == [str(mine), {}]
+
+
+def test_a_parameter_file_that_does_not_exist_is_an_error(launch_file: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"params_file:=.*nowhere\.yaml: there is no such file"):
+        started_with(launch_file, params_file=str(tmp_path / "nowhere.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        *((text, True) for text in ("true", "True", "TRUE", "yes", "on", "On", "y", "1", " true ")),
+        *((text, False) for text in ("false", "False", "no", "NO", "off", "n", "0")),
+    ],
+)
+@pytest.mark.parametrize("name", ["autostart", "tf_broadcast", "use_sim_time"])
+def test_a_switch_is_read_as_yaml_reads_it(launch_file: dict[str, Any], name: str, text: str, value: bool) -> None:
+    assert started_with(launch_file, **{name: text})["parameters"][1] == {name: value}
+
+
+@pytest.mark.parametrize("text", ["ture", "2", "none", "-"])
+def test_a_switch_that_is_neither_is_an_error(launch_file: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=f"autostart:={text}: must be true or false"):
+        started_with(launch_file, autostart=text)

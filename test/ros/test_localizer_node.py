@@ -209,6 +209,15 @@ def test_odometry_of_another_frame_is_refused_and_diagnosed(active: Robot, world
     assert values["odometry"] in message
 
 
+def test_frames_with_the_leading_slash_of_ros_1_are_the_same_frames(active: Robot, world: World) -> None:
+    for _ in range(10):
+        next(active.stamps_ns)
+    first, second = (active.message(world.points(place)) for place in (11, 12))
+    drive_between(active, first, second, 0.7, child_frame_id="/base_link")
+    active.localize(first)
+    assert active.report(second)[1].endswith("moved 0.70 0.00 0.000")
+
+
 def test_tf_holds_where_the_odometrys_frame_lies_but_only_while_localized(active: Robot, world: World) -> None:
     sent: list[TransformStamped] = []
     subscription = active.node.create_subscription(TransformStamped, "/tf_sent", sent.append, 100)
@@ -251,20 +260,46 @@ def test_an_initial_pose_reaches_the_localizer_in_the_grid(active: Robot, world:
     _, _, values = active.diagnosis_with("initial pose", "taken")
     grid, heading = in_grid(frame_of(world), np.array([12.0, 15.0, 0.0]), 1.0)
     assert f"{grid[0]:.1f} E, {grid[1]:.1f} N" in values["initial pose"]
-    _, message, _ = active.report(active.message(world.points(16)))
+    _, message, _ = active.report(active.message(world.points(20)))
     assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take" in message
     # TF explains a frame that lies at (100, 50) and is rotated by a quarter.
     active.guesses.publish(guess("odom_far", -40.0, 90.0, yaw=0.5))
     grid, heading = in_grid(frame_of(world), np.array([10.0, 10.0, 0.0]), 0.5 + math.pi / 2)
     active.diagnosis_with("initial pose", f"{grid[0]:.1f} E, {grid[1]:.1f} N")
-    _, message, _ = active.report(active.message(world.points(15)))
+    _, message, _ = active.report(active.message(world.points(21)))
     assert f"prior at {grid[0]:.1f} {grid[1]:.1f} to {heading:.3f} give or take 2.999 2.001 0.100" in message, (
         "its north is west"
     )
 
 
+def test_an_initial_pose_in_the_frame_of_the_odometry_is_where_the_last_fix_puts_it(
+    active: Robot, world: World
+) -> None:
+    """The node publishes that transform, so it knows it without TF; frames of ROS 1 begin with a slash."""
+    first, second = (active.message(world.points(place)) for place in (22, 23))
+    drive_between(active, first, second, 0.9)
+    active.localize(first)
+    assert active.localize(second).status.status == NavSatStatus.STATUS_FIX
+    # The odometry stands 500.9 m along x at the second scan.
+    T_odom_guess, T_odom_base, T_map_base = np.eye(4), np.eye(4), np.eye(4)
+    T_odom_guess[:2, 3], T_odom_base[0, 3] = (505.9, 2.0), 500.9
+    position, yaw = pose_in_map(world, 23)
+    T_map_base[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    T_map_base[:3, 3] = position
+    T_map_guess = T_map_base @ np.linalg.inv(T_odom_base) @ T_odom_guess
+    for frame_id in ("odom", "/odom"):
+        active.guesses.publish(guess(frame_id, 505.9, 2.0))
+        grid, _ = in_grid(frame_of(world), T_map_guess[:3, 3], yaw)
+        active.diagnosis_with("initial pose", f"taken: {grid[0]:.1f} E, {grid[1]:.1f} N")
+    active.call(Empty, "/reinitialize_global_localization", Empty.Request())
+    active.guesses.publish(guess("odom", 505.9, 2.0))
+    active.diagnosis_with("initial pose", "refused: TF has no pose of 'odom' in 'map'")
+
+
 def test_an_initial_pose_that_tf_explains_leaves_the_mounting_of_the_lidar_alone(active: Robot, world: World) -> None:
     """Where mounting_from_tf is false: TF has the frame of the clouds too, in another place than the settings."""
+    for _ in range(10):
+        next(active.stamps_ns)  # no odometry, by which the robot would have moved and seen something else
     before = best_candidate(active, world, 18)
     active.guesses.publish(guess("odom_far", -40.0, 90.0))
     active.diagnosis_with("initial pose", "taken")
@@ -289,7 +324,7 @@ def test_an_initial_pose_that_nothing_explains_is_refused_with_the_reason(active
     ):
         active.guesses.publish(message)
         active.diagnosis_with("initial pose", reason)
-    assert active.localize(world.points(16)).status.status == NavSatStatus.STATUS_FIX
+    assert active.localize(world.points(24)).status.status == NavSatStatus.STATUS_FIX
 
 
 def test_the_imu_gives_the_heading_until_something_better_does(active: Robot, world: World) -> None:
@@ -707,9 +742,8 @@ def truncated_map(folder: Path, world: World) -> Path:
     [
         ({"scan.min_rang_m": 2.0}, "unknown parameter 'scan.min_rang_m': did you mean 'scan.min_range_m'?"),
         ({"top_k": 0}, "'top_k' must lie between 1 and 1000"),
-        pytest.param(
-            {"qos_overrides./lidar.subscription.depth": 3}, "overridden for /points, /imu", marks=pytest.mark.slow
-        ),
+        ({"odom_frame_id": "/odom"}, "'odom_frame_id' must not begin with a slash, which tf2 refuses: set 'odom'"),
+        ({"--params-file": "NOWHERE"}, "nowhere"),
         pytest.param({"map": '""'}, "parameter 'map' is empty", marks=pytest.mark.slow),
         ({"weights": "OTHER"}, "was made by other weights"),
         ({"map": "NOWHERE"}, "does not exist; build one with"),

@@ -36,8 +36,8 @@ from crossloc3d_ros.training.alignment import (
     fit_alignment,
     fit_weights,
     is_right,
-    prepared_of,
 )
+from crossloc3d_ros.training.queries import Query, query_of
 from crossloc3d_ros.types import AlignedPoses, Float64Array, no_aligned_poses, no_candidates
 
 Learned = tuple[ObservationModel, list[MeasuredPoses]]
@@ -50,14 +50,18 @@ def pose_set(simulated_town: tuple[PoseSet, Any]) -> PoseSet:
     return simulated_town[0]
 
 
+def queries(scans: Sequence[RawScan]) -> list[Query]:
+    return [query_of(scan) for scan in scans]
+
+
 @pytest.fixture(scope="module")
 def sets(pose_set: PoseSet) -> list[LearningSet]:
     """Divide the town into a western and an eastern fold, each with the scans of the other town."""
     on_map = sorted((s for s in pose_set.scans if pose_set.on_map[s.area]), key=lambda s: float(s.T_grid_base[0, 3]))
     off_map = [scan for scan in pose_set.scans if not pose_set.on_map[scan.area]]
     return [
-        LearningSet("the west", "west", pose_set.map_folder, on_map[:4], off_map[:2]),
-        LearningSet("the east", "east", pose_set.map_folder, on_map[4:], off_map[2:]),
+        LearningSet("the west", "west", pose_set.map_folder, queries(on_map[:4]), queries(off_map[:2])),
+        LearningSet("the east", "east", pose_set.map_folder, queries(on_map[4:]), queries(off_map[2:])),
     ]
 
 
@@ -131,7 +135,7 @@ def test_nothing_is_fitted_to_poses_of_which_none_is_right() -> None:
             fit_weights(measured)
 
 
-def poses_at(scan: RawScan, offsets: Sequence[Sequence[float]]) -> AlignedPoses:
+def poses_at(scan: Query, offsets: Sequence[Sequence[float]]) -> AlignedPoses:
     """Return poses so many metres east and north and radians from the truth."""
     offset = np.array(offsets, np.float64)
     count = len(offset)
@@ -144,7 +148,7 @@ def poses_at(scan: RawScan, offsets: Sequence[Sequence[float]]) -> AlignedPoses:
 
 
 def test_a_pose_is_right_within_two_metres_and_five_degrees(pose_set: PoseSet) -> None:
-    scan = pose_set.scans[0]
+    scan = query_of(pose_set.scans[0])
     poses = poses_at(
         scan,
         [[0, 0, 0], [RIGHT_M - 0.01, 0, 0], [0, -RIGHT_M - 0.01, 0], [0, 0, RIGHT_RAD - 1e-3],
@@ -170,7 +174,7 @@ class Found:
         return self.poses, np.tile(np.arange(len(self.poses), dtype=np.float64)[:, None], len(MEASURES))
 
 
-def kept_of(poses: AlignedPoses, scan: RawScan, on_map: bool = True) -> tuple[list[int], int | None]:
+def kept_of(poses: AlignedPoses, scan: Query, on_map: bool = True) -> tuple[list[int], int | None]:
     """Return the numbers of the poses that are learned from, and which of them is right."""
     measured = training._measured_poses("a set", Found(poses), scan, on_map)  # type: ignore[arg-type]
     assert measured is not None
@@ -179,7 +183,7 @@ def kept_of(poses: AlignedPoses, scan: RawScan, on_map: bool = True) -> tuple[li
 
 
 def test_a_pose_that_is_near_but_not_right_teaches_nothing(pose_set: PoseSet) -> None:
-    scan = pose_set.scans[0]
+    scan = query_of(pose_set.scans[0])
     far, near, turned = [50.0, 0.0, 0.0], [NEAR_M - 0.1, 0.0, 0.0], [0.0, 0.0, math.pi]
     poses = poses_at(scan, [far, near, turned, [0.5, 0.0, 0.0], [NEAR_M + 0.1, 0.0, 0.0], [0.0, 0.5, 0.0]])
     assert kept_of(poses, scan) == ([0, 3, 4], 1)  # of two right ones the better
@@ -188,7 +192,7 @@ def test_a_pose_that_is_near_but_not_right_teaches_nothing(pose_set: PoseSet) ->
 
 
 def test_the_right_pose_is_learned_from_however_many_are_better(pose_set: PoseSet) -> None:
-    scan = pose_set.scans[0]
+    scan = query_of(pose_set.scans[0])
     poses = poses_at(scan, [*([100.0 + i, 0.0, 0.0] for i in range(30)), [0.0, 0.0, 0.0]])
     kept, right = kept_of(poses, scan)
     assert kept == [*range(15), 30]
@@ -253,10 +257,13 @@ def test_poses_are_those_of_the_sets_and_nothing_is_right_off_the_map(
 def test_a_learned_model_finds_its_scans_and_doubts_strangers(pose_set: PoseSet, learned: Learned) -> None:
     aligner = Aligner(AerialMap.load(pose_set.map_folder), AlignmentConfig(), learned[0])
     for scan in pose_set.scans[::3]:
-        T = scan.T_base_lidar
-        found = aligner.align(prepared_of(scan), (float(T[0, 3]), float(T[1, 3])), no_candidates(), search_map=True)
+        query = query_of(scan)
+        alignment = aligner.begin(query.evidence, no_candidates())
+        assert alignment is not None
+        alignment.search_map()
+        found = alignment.result()
         if pose_set.on_map[scan.area]:
-            assert is_right(found, scan)[0]
+            assert is_right(found, query)[0]
             assert found.probabilities[0] > 0.5
         else:
             assert found.probabilities.sum() < 0.5

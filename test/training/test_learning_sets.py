@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 
 from crossloc3d_ros.aerial_map.store import AerialMap
+from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.datasets.belief_conditions import DELIVERED, Condition
 from crossloc3d_ros.datasets.belief_sets import BeliefMap, BeliefSet, BeliefSets
+from crossloc3d_ros.datasets.pose_drives import DrivePlan, RawDrive
 from crossloc3d_ros.datasets.pose_sets import PoseSet
 from crossloc3d_ros.datasets.raw_scans import RawScan, RawScans
 from crossloc3d_ros.errors import TrainingError
 from crossloc3d_ros.training import learning_sets as module
 from crossloc3d_ros.training.alignment import LearningSet
 from crossloc3d_ros.training.learning_sets import learning_sets
+from crossloc3d_ros.training.queries import Query, local_maps, query_of
 
 FEW = Condition("few", every_point=4)
 POINTS = 40
@@ -57,11 +60,11 @@ def sets(simulated_town: tuple[PoseSet, Any], town_map: AerialMap) -> BeliefSets
     )
 
 
-def places(scans: Sequence[RawScan]) -> np.ndarray:
+def places(scans: Sequence[Query]) -> np.ndarray:
     return np.array([scan.T_grid_base[:2, 3] for scan in scans]).reshape(-1, 2)
 
 
-def lies_on(aerial_map: AerialMap, scans: Sequence[RawScan]) -> np.ndarray:
+def lies_on(aerial_map: AerialMap, scans: Sequence[Query]) -> np.ndarray:
     west, south, east, north = aerial_map.bounds
     x, y = places(scans).T
     return (x > west) & (x < east) & (y > south) & (y < north)
@@ -76,6 +79,13 @@ def same(one: Sequence[LearningSet], other: Sequence[LearningSet]) -> bool:
     return rows(one) == rows(other)
 
 
+@pytest.fixture(autouse=True)
+def everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take all queries that there are."""
+    monkeypatch.setattr(module, "_QUERIES", 1000)
+    monkeypatch.setattr(module, "_STRANGERS", 1000)
+
+
 def test_strangers_never_come_from_the_places_of_a_map(sets: BeliefSets) -> None:
     for each in learning_sets(sets):
         aerial_map = AerialMap.load(each.map_folder)
@@ -86,13 +96,45 @@ def test_strangers_never_come_from_the_places_of_a_map(sets: BeliefSets) -> None
     assert len(strangers) == 3 + 2 * 30
 
 
-def test_scans_are_as_their_conditions_say(sets: BeliefSets) -> None:
+def straight_drive() -> RawDrive:
+    """Return a drive of 40 m eastwards, a scan every two metres, each of too few points to contradict another."""
+    rng, scans = np.random.default_rng(3), []
+    stamps_ns = 1_000_000_000 * np.arange(1, 22)
+    for i, stamp_ns in enumerate(stamps_ns.tolist()):
+        pose = np.eye(4)
+        pose[0, 3] = 2.0 * i
+        scans.append(RawScan(rng.normal(0, 9, (POINTS, 3)).astype(np.float32), pose, np.eye(4), stamp_ns=stamp_ns))
+    plan = DrivePlan("straight", 0, 40.0, 2.0, 1, 0, False, 1.2, 0.0)
+    times_s = np.arange(1.0, 21.05, 0.1)
+    odometry = np.column_stack([2.0 * times_s, np.zeros((len(times_s), 2))])
+    return RawDrive(plan, RawScans.of(scans), np.round(times_s * 1e9).astype(np.int64), odometry)
+
+
+def cells_of(queries: Sequence[Query]) -> list[bytes]:
+    return sorted(query.xy_m.tobytes() + query.channel.tobytes() for query in queries)
+
+
+def test_queries_are_of_the_scans_as_their_conditions_say(sets: BeliefSets) -> None:
     learned = learning_sets(sets)
-    points = {each.name: {len(scan.points) for scan in each.on_map} for each in learned}
-    assert points["other, as delivered"] == {POINTS}
-    assert points["other, few"] == {POINTS // FEW.every_point}
-    on_town = sorted(len(scan.points) for scan in learned[0].off_map)
-    assert on_town[:60] == [POINTS // FEW.every_point] * 30 + [POINTS] * 30
+    other = sets.on_map[1].pose_set
+    for condition in (DELIVERED, FEW):
+        of_both_folds = [q for each in learned if each.name == f"other, {condition.name}" for q in each.on_map]
+        expected = [query_of(condition.seen(scan)) for scan in other.scans]
+        assert cells_of(of_both_folds) == cells_of(expected)
+        assert set(cells_of(expected)) <= set(cells_of(learned[0].off_map)), "strangers on the town"
+
+
+def test_along_drives_local_maps_are_learned_from_too(sets: BeliefSets) -> None:
+    town, drive = sets.on_map[0].pose_set, straight_drive()
+    driven = BeliefSet("town", DELIVERED, town, (drive,), True)
+    on_map = [query for each in learning_sets(BeliefSets((driven,), ())) for query in each.on_map]
+    singles = [query_of(scan) for scan in town.scans if town.on_map[scan.area]]
+    along = local_maps(drive, drive.scans, AlignmentConfig().local_map_m)
+    assert cells_of(on_map) == cells_of([*singles, *along])
+    assert [float(query.T_grid_base[0, 3]) for query in along] == pytest.approx([10.0, 20.0, 30.0, 40.0])
+    # Each scan adds cells of its own, until the oldest are left behind.
+    single = max(len(query_of(scan).channel) for scan in drive.scans)
+    assert single < len(along[0].channel) < len(along[1].channel) < len(along[2].channel)
 
 
 def test_folds_share_no_area(sets: BeliefSets) -> None:
@@ -124,7 +166,7 @@ def test_maps_of_the_same_places_are_one_fold(sets: BeliefSets, town_map: Aerial
 
 
 def test_a_seed_makes_the_same_sets_again(sets: BeliefSets, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_SCANS", 4)
+    monkeypatch.setattr(module, "_QUERIES", 4)
     monkeypatch.setattr(module, "_STRANGERS", 6)
     learned = learning_sets(sets, 1)
     assert {len(each.on_map) for each in learned} == {4}

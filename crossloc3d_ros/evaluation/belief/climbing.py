@@ -9,6 +9,7 @@ from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.localization.alignment.aligner import Aligner
+from crossloc3d_ros.localization.alignment.evidence import evidence_of
 from crossloc3d_ros.types import DescriptorEncoder, Estimate, Float64Array, Hypotheses
 
 COLUMN = "climbed"
@@ -34,7 +35,8 @@ class Climber:
         if prepared.patch is None:
             return nothing
         sensor_xy_m = float(mounting[0, 3]), float(mounting[1, 3])
-        alignment = self._aligner.begin(prepared, sensor_xy_m, estimate.candidates)
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
+        alignment = self._aligner.begin(evidence, estimate.candidates)
         if alignment is None:
             return nothing
         answer = estimate.aligned

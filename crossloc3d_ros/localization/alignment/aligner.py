@@ -19,7 +19,7 @@ from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.config import AlignmentConfig, usable_threads
 from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
-from crossloc3d_ros.localization.alignment.local_null import measures
+from crossloc3d_ros.localization.alignment.local_null import measures, with_behind_best
 from crossloc3d_ros.localization.alignment.observation_model import MEASURES, ObservationModel
 from crossloc3d_ros.localization.alignment.pose_search import (
     are_near,
@@ -58,6 +58,7 @@ MAP_COARSE_FACTOR, MAP_FINE_FACTOR = 4, 2
 """So many times as many maxima are refined on the whole map as around candidates."""
 _PLACE_M = 35.0  # so far from the centre of its submap a pose is still of its place
 _NOT_RETRIEVED = 0.2  # likelihood ratio of a place that is not among the candidates
+_BEYOND_NEWEST = 8.0  # nats: the newest scan of a local map refutes a pose that only the scans before it speak for
 _SAME_M, _SAME_RAD = 3.0, math.radians(12.0)  # poses this near belong to one maximum
 _EXPLAINED = MEASURES.index("explained")
 # Where the score is sampled for the covariance: about two standard deviations of a good pose to each side.
@@ -111,18 +112,13 @@ class Aligner:
         """Return whether a scan has evidence in enough cells to be aligned."""
         return len(evidence_of(prepared.place, prepared.sensor_height_m)) >= self.config.min_cells
 
-    def begin(
-        self, prepared: PreparedScan, sensor_xy_m: tuple[float, float], candidates: Candidates
-    ) -> Alignment | None:
-        """Return the alignment of a scan, without any search yet; None for a scan of too little evidence.
+    def begin(self, evidence: Evidence, candidates: Candidates, newest: Evidence | None = None) -> Alignment | None:
+        """Return the alignment of a scan, or of a local map of several, without any search yet; None for too little.
 
-        `sensor_xy_m`: where the sensor is on the base. The candidates' probabilities count wherever the poses come
-        from.
+        The candidates' probabilities count wherever the poses come from. Of a local map, `newest` is the evidence of
+        its newest scan: the whole says which pose it is, the newest where exactly, free of the errors of odometry.
         """
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
-        if len(evidence) < self.config.min_cells:
-            return None
-        return Alignment(self, evidence, candidates)
+        return None if len(evidence) < self.config.min_cells else Alignment(self, evidence, candidates, newest)
 
     def align(
         self,
@@ -134,8 +130,12 @@ class Aligner:
         search_candidates: bool = True,
         search_map: bool = False,
     ) -> AlignedPoses:
-        """Return where the scan fits, best first: around the candidates, on the whole map, at the hypotheses."""
-        alignment = self.begin(prepared, sensor_xy_m, candidates)
+        """Return where the scan fits, best first: around the candidates, on the whole map, at the hypotheses.
+
+        `sensor_xy_m`: where the sensor is on the base.
+        """
+        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
+        alignment = self.begin(evidence, candidates)
         if alignment is None:
             return no_aligned_poses()
         if search_candidates:
@@ -190,7 +190,9 @@ def calibration_offset(aerial_map: AerialMap, model: ObservationModel, config: A
 class Alignment:
     """The alignment of one scan, search by search: each builds on what the ones before found."""
 
-    def __init__(self, aligner: Aligner, evidence: Evidence, candidates: Candidates) -> None:
+    def __init__(
+        self, aligner: Aligner, evidence: Evidence, candidates: Candidates, newest: Evidence | None = None
+    ) -> None:
         """Search nowhere yet."""
         self._aligner, self._config, self._pool = aligner, aligner.config, aligner.pool
         self._likelihood = aligner.likelihood
@@ -198,6 +200,8 @@ class Alignment:
         self._places = aligner.local(candidates.grid[:, :2])
         self._fine = fine_evidence(evidence)
         self._climb_evidence = self._fine.sample(_CLIMB_HITS, _CLIMB_FREE)
+        self._newest = None if newest is None or newest is evidence else fine_evidence(newest)
+        self._newest_known: dict[bytes, tuple[float, Float64Array]] = {}
         self._maxima, self._is_refined = no_peaks(), np.empty(0, np.bool_)
         self._most_refined = 0
         self._found, self._tracked = _no_poses(), _no_poses()
@@ -226,7 +230,7 @@ class Alignment:
 
     def is_sufficient(self) -> bool:
         """Return whether one pose is probable enough that the rest of the map need not be searched."""
-        probabilities = self._weighted()[2]
+        probabilities = self._weighted()[3]
         return bool(len(probabilities)) and float(probabilities.max()) >= self._config.sufficient_probability
 
     def result(self) -> AlignedPoses:
@@ -234,13 +238,14 @@ class Alignment:
 
         Every hypothesis has one pose of its own in the result, as far as it lies on the map.
         """
-        refined, log_likelihood, probabilities = self._weighted()
+        refined, _, log_likelihood, probabilities = self._weighted()
         if not len(refined.poses):
             return no_aligned_poses()
+        poses = self._where_exactly(refined.poses, log_likelihood)
         return AlignedPoses(
-            grid=self._aligner.on_grid(refined.poses),
-            heading_rad=_headings(refined.poses[:, 2]),
-            covariance=self._covariances(refined.poses),
+            grid=self._aligner.on_grid(poses),
+            heading_rad=_headings(poses[:, 2]),
+            covariance=self._covariances(poses),
             log_likelihood=log_likelihood,
             probabilities=probabilities,
             inliers=np.clip(refined.measures[:, _EXPLAINED], 0.0, 1.0),
@@ -251,7 +256,7 @@ class Alignment:
 
     def measured(self) -> tuple[AlignedPoses, Float64Array]:
         """Return where the scan fits, best first, and the `MEASURES` (n, M) of each pose."""
-        return self.result(), self._weighted()[0].measures
+        return self.result(), self._weighted()[1]
 
     def _search(self, runs: Int64Array, coarse_maxima: int, fine_maxima: int) -> None:
         """Search the runs of coarse cells, and refine the best maxima that were not refined before."""
@@ -288,20 +293,22 @@ class Alignment:
                 source[near] = away.argmin(axis=1)[near]
         return _Poses(peaks.poses, scores, measured, converged, source)
 
-    def _weighted(self) -> tuple[_Poses, Float64Array, Float64Array]:
-        """Return the poses that are kept, best first, with log likelihoods and probabilities."""
+    def _weighted(self) -> tuple[_Poses, Float64Array, Float64Array, Float64Array]:
+        """Return the poses that are kept, best first, their `MEASURES` (p, M), log likelihoods and probabilities."""
         order = np.argsort(-self._found.scores, kind="stable")
         found = self._found.take(merge(self._found.poses, order, _SAME_M, _SAME_RAD))
         poses = found.join(self._tracked)
-        log_likelihood = self._aligner.model.log_likelihood(poses.measures)
+        measured = with_behind_best(poses.measures, poses.scores, len(self._fine))
+        log_likelihood = self._aligner.model.log_likelihood(measured)
+        log_likelihood = np.minimum(log_likelihood, self._of_newest(poses, log_likelihood) + _BEYOND_NEWEST)
         log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses) + self._aligner.offset
         order = np.argsort(-log_likelihood, kind="stable")
-        poses, log_likelihood = poses.take(order), log_likelihood[order]
+        poses, measured, log_likelihood = poses.take(order), measured[order], log_likelihood[order]
         log_odds = log_likelihood + self._aligner.log_prior
         # A hypothesis and a maximum of the search may be one pose: it counts once.
         near = are_near(poses.poses, _SAME_M, _SAME_RAD)
         log_odds[np.tril(near, -1).any(axis=1)] = -np.inf
-        return poses, log_likelihood, np.exp(log_odds - np.logaddexp(0.0, np.logaddexp.reduce(log_odds)))
+        return poses, measured, log_likelihood, np.exp(log_odds - np.logaddexp(0.0, np.logaddexp.reduce(log_odds)))
 
     def _descriptor_log_ratios(self, poses: Float64Array) -> Float64Array:
         """Return the log likelihood ratios (p,) of the descriptors: probability near a pose over chance level."""
@@ -316,11 +323,46 @@ class Alignment:
         away = np.hypot(*(poses[:, None, :2] - self._places[None]).transpose(2, 0, 1))
         return np.where(np.isnan(away), np.inf, away)
 
+    def _of_newest(self, poses: _Poses, log_likelihood: Float64Array) -> Float64Array:
+        """Return the log likelihood ratios (p,) of the newest scan alone, for poses that the local map speaks for.
+
+        Infinite where it does not, and where there is no local map.
+        """
+        alone = np.full(len(log_likelihood), np.inf)
+        some = np.flatnonzero(log_likelihood > 0.0)
+        if self._newest is None or not len(self._newest) or not len(some):
+            return alone
+        missing = [i for i in some.tolist() if poses.poses[i].tobytes() not in self._newest_known]
+        if missing:
+            at = poses.poses[missing]
+            sample = self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
+            scores = scores_at(self._newest, self._likelihood, at, self._pool)
+            found = measures(self._newest, sample, scores, self._likelihood, at, self._pool)
+            for i, score, row in zip(missing, scores.tolist(), found, strict=True):
+                self._newest_known[poses.poses[i].tobytes()] = (score, row)
+        known = [self._newest_known[poses.poses[i].tobytes()] for i in some.tolist()]
+        measured = with_behind_best(
+            np.array([row for _, row in known]), np.array([s for s, _ in known]), len(self._newest)
+        )
+        alone[some] = self._aligner.model.log_likelihood(measured)
+        return alone
+
+    def _where_exactly(self, poses: Float64Array, log_likelihood: Float64Array) -> Float64Array:
+        """Return poses (p, 3), those that count at all moved to where the newest scan of a local map fits best."""
+        if self._newest is None:
+            return poses
+        exact, counts = poses.copy(), log_likelihood > 0.0
+        evidence = self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
+        exact[counts] = climb(evidence, self._likelihood, poses[counts], reach_m=_SAME_M, pool=self._pool)[0].poses
+        return exact
+
     def _covariances(self, poses: Float64Array) -> Float64Array:
         """Return the covariances (p, 3, 3) of poses from the shape of the score around them."""
         around_them = (poses[:, None] + _SHAPE).reshape(-1, 3)
-        scores = scores_at(self._climb_evidence, self._likelihood, around_them, self._pool).reshape(len(poses), -1)
-        scores *= len(self._fine) / max(len(self._climb_evidence), 1)  # a sample of the cells stands for all
+        whole = self._fine if self._newest is None else self._newest
+        some = whole.sample(_CLIMB_HITS, _CLIMB_FREE)
+        scores = scores_at(some, self._likelihood, around_them, self._pool).reshape(len(poses), -1)
+        scores *= len(whole) / max(len(some), 1)  # a sample of the cells stands for all
         weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.covariance_temperature)
         weights /= weights.sum(axis=1, keepdims=True)
         offsets = _SHAPE - (weights @ _SHAPE)[:, None]
@@ -337,7 +379,7 @@ class _Poses:
     scores: Float64Array
     """(p,) nats, of the fine evidence."""
     measures: Float64Array
-    """(p, M) the `MEASURES` of each."""
+    """(p, M - 1) the `MEASURES` of each, but for how far behind the best it is."""
     converged: BoolArray
     """(p,) whether the climb converged near where it began."""
     source: Int64Array
@@ -353,7 +395,7 @@ class _Poses:
 
 def _no_poses() -> _Poses:
     return _Poses(
-        np.empty((0, 3)), np.empty(0), np.empty((0, len(MEASURES))), np.empty(0, np.bool_), np.empty(0, np.int64)
+        np.empty((0, 3)), np.empty(0), np.empty((0, len(MEASURES) - 1)), np.empty(0, np.bool_), np.empty(0, np.int64)
     )
 
 

@@ -12,6 +12,9 @@ elsewhere:
 * **Surroundings.** The same evidence at shifts around the pose, in its heading, and turned in place. The evidence of
   each sector around the robot is a witness of its own: by how many standard deviations of the surroundings its score
   lies above their mean. At the right pose all sectors fit, at a wrong one a few; so the mean over the sectors counts.
+* **Amount.** Few cells fit somewhere by chance: the logarithm of their number, as far as it is small.
+* **Behind the best.** How much more another pose of the same scan explains. Along a canal hardly any pose stands out of
+  its surroundings, but the right one scores best all the same.
 
 `ObservationModel.log_likelihood` weighs these measures as `train alignment` learned it over surveys of all kinds.
 """
@@ -38,6 +41,10 @@ EXPLAINED_BOUNDS = (-1.0, 1.2)
 _LEAST_DEVIATION = 1.0  # nats: of surroundings without any structure
 _LEAST_SHARE = 0.5  # of the mean of all sectors, is a sector's deviation: over water there is nothing to stand out of
 _LEAST_PROMINENCE = 0.1  # for its logarithm; a pose that stands out as little is as good as refuted
+_MOST_PROMINENCE = math.e  # beyond, a pose is no likelier to be right
+_ENOUGH = 3000  # cells: beyond, more of them say no more
+_BEHIND_PER_CELL = 0.25  # nats: by about so much the best pose explains a cell better than any pose at random
+_FAR_BEHIND = 0.6  # of that: from there on it is one pose of many
 
 
 def measures(
@@ -48,12 +55,12 @@ def measures(
     poses: Float64Array,
     pool: ThreadPool = SERIAL,
 ) -> Float64Array:
-    """Return the `MEASURES` (p, M) of poses (p, 3) with scores (p,), nats.
+    """Return the `MEASURES` (p, M - 1) of poses (p, 3) with scores (p,), nats; all but the last of them.
 
     `evidence`: all that the scores are sums over; `sample`: as much of it as the surroundings are compared by.
     """
     if not len(poses):
-        return np.empty((0, len(MEASURES)))
+        return np.empty((0, len(MEASURES) - 1))
     here, elsewhere = _expectations(evidence, likelihood, poses, pool)
     explained = (scores - elsewhere) / np.maximum(here - elsewhere, _LEAST_DEVIATION)
     columns = [np.clip(explained, *EXPLAINED_BOUNDS)]
@@ -65,8 +72,18 @@ def measures(
         deviation = around.std(axis=1)
         deviation = np.maximum(deviation, _LEAST_SHARE * deviation.mean(axis=1, keepdims=True))
         above = (own - around.mean(axis=1)) / np.maximum(deviation, _LEAST_DEVIATION)
-        columns.append(np.log(np.maximum(above.mean(axis=1), _LEAST_PROMINENCE)))
-    return np.column_stack(columns)
+        columns.append(np.log(np.clip(above.mean(axis=1), _LEAST_PROMINENCE, _MOST_PROMINENCE)))
+    amount = math.log(min(max(len(evidence), 1) / _ENOUGH, 1.0))
+    return np.column_stack([*columns, np.full(len(poses), amount)])
+
+
+def with_behind_best(measured: Float64Array, scores: Float64Array, cells: int) -> Float64Array:
+    """Return `MEASURES` (p, M) of all poses of a scan, whose scores (p,) are sums over so many cells.
+
+    `measured` (p, M - 1): what `measures` returns of them.
+    """
+    behind = (np.max(scores, initial=-np.inf) - scores) / (_BEHIND_PER_CELL * max(cells, 1))
+    return np.column_stack([measured, -np.sqrt(np.minimum(behind, _FAR_BEHIND))])
 
 
 def _sectors(evidence: Evidence) -> Int64Array:

@@ -58,9 +58,10 @@ _SHARE_BOUNDS = (1e-6, 1.0 - 1e-6)  # for their logarithms
 _PRIOR = 50.0  # pseudo-observations that a class starts with
 _MAX_LOG_RATIO = 3.0  # of one cell; the 16 bit sums of the search rely on it
 _MAX_REFUTATION = 1.0  # of a closed cell: a house may have gone since the survey, and hundreds of its cells with it
-MEASURES = ("explained", "above shifted", "above spun")
-"""What a pose is weighed by, see `alignment.local_null`: the share of the evidence that it explains, and the logarithms
-of by how many standard deviations its sectors stand out of its surroundings."""
+MEASURES = ("explained", "above shifted", "above spun", "amount", "behind best")
+"""What a pose is weighed by, see `alignment.local_null`: the share of the evidence that it explains, the logarithms of
+by how many standard deviations its sectors stand out of its surroundings, how much evidence there is, and by how much
+another pose explains it better."""
 _TENSORS = ("log_ratios", "search_ratios", "hit_share", "weights")
 _CLOSED = 2  # from this step on a cell is inside of something
 

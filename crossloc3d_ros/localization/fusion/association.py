@@ -25,7 +25,7 @@ class Branches:
     corrected_by: Int64Array
     """(b,) row of the pose that each was corrected by; -1 = not detected by this scan."""
     log_unseen: Float64Array
-    """(n,) log weight of each hypothesis before branching, as it were without this scan's own evidence."""
+    """(n,) log weight of each hypothesis before branching, as it were without this scan's own evidence, all of it."""
 
 
 def measurements(aligned: AlignedPoses, config: FusionConfig) -> AlignedPoses:
@@ -78,9 +78,10 @@ def branch(before: Mixture, poses: AlignedPoses, novelty: float, travelled_m: fl
         return Branches(before, np.empty(0, np.int64), np.empty(0))
     log_clutter = math.log(config.clutter_probability)
     found = innovations(before, poses, config)
+    log_fitting = math.log1p(-config.clutter_probability) + found.log_likelihood
     # What follows a hypothesis is not independent of what it was born of: a wrong one goes on to fit for a while.
-    log_detected = math.log1p(-config.clutter_probability) + found.log_likelihood - config.null_log_likelihood
-    evidence = log_sum(np.concatenate([log_detected, np.full((n, 1), log_clutter)], axis=1), axis=1)
+    log_detected = log_fitting - config.null_log_likelihood
+    evidence = _or_clutter(log_detected, log_clutter)
     moved_on, gain = _spot_evidence(before, evidence, novelty)
     total = before.log_weight + gain
     unseen = dataclasses.replace(moved_on, log_weight=total + log_clutter - evidence)
@@ -89,7 +90,15 @@ def branch(before: Mixture, poses: AlignedPoses, novelty: float, travelled_m: fl
         correct(moved_on, poses, found, h, i, travelled_m, config),
         log_weight=(total[:, None] + log_detected - evidence[:, None])[h, i],
     )
-    return Branches(unseen.join(seen), np.concatenate([np.full(n, -1), i]), total - evidence)
+    # A robot that was carried away just now fits by chance alone where it was expected: nothing was selected there.
+    log_unseen = total - _or_clutter(log_fitting, log_clutter)
+    return Branches(unseen.join(seen), np.concatenate([np.full(n, -1), i]), log_unseen)
+
+
+def _or_clutter(log_detected: Float64Array, log_clutter: float) -> Float64Array:
+    """Return the evidence (n,) for hypotheses that explain poses (n, m) by as much, or the scan as clutter."""
+    clutter = np.full((len(log_detected), 1), log_clutter)
+    return np.asarray(log_sum(np.concatenate([log_detected, clutter], axis=1), axis=1))
 
 
 def births(

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from crossloc3d_ros.localization.inputs import check_stamp
 from crossloc3d_ros.types import Float64Array
 
 PLAUSIBLE_MPS2 = (5.0, 15.0)
@@ -17,7 +18,7 @@ STALE_NS = 1_000_000_000
 def is_gravity(acceleration: Float64Array) -> bool:
     """Return whether a specific force (3,), m/s2, can be that of gravity; one that is not a number cannot."""
     low, high = PLAUSIBLE_MPS2
-    return low <= float(np.linalg.norm(acceleration)) <= high
+    return np.shape(acceleration) == (3,) and low <= float(np.linalg.norm(acceleration)) <= high
 
 
 class GravityFilter:
@@ -34,6 +35,7 @@ class GravityFilter:
 
     def update(self, stamp_ns: int, acceleration: Float64Array) -> bool:
         """Take in one sample (3,) and return whether it was plausible; a stamp that goes backwards starts anew."""
+        check_stamp(stamp_ns, "the stamp of an acceleration")
         if not is_gravity(acceleration):
             return False
         elapsed_ns = stamp_ns - self._stamp_ns

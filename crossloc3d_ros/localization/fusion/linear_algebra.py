@@ -46,6 +46,29 @@ def at_least(covariance: Float64Array, position_m: float, heading_deg: float) ->
     )
 
 
+def why_no_covariance(covariance: Float64Array) -> str:
+    """Return why a matrix (3, 3) cannot be a covariance, as the end of a sentence; empty where it can.
+
+    Infinite variances, without correlations, are those of what is not known.
+    """
+    variances = np.diag(covariance)
+    if np.isnan(covariance).any() or np.isneginf(covariance).any() or (variances < 0.0).any():
+        return "holds what is no number, or negative variances"
+    known = np.isfinite(variances)
+    if not np.isfinite(covariance[~np.eye(3, dtype=bool)]).all():
+        return "holds infinite correlations"
+    scale = np.sqrt(np.where(known & (variances > 0.0), variances, 1.0))
+    with np.errstate(over="ignore"):  # of an impossible correlation
+        unit = covariance[np.ix_(known, known)] / scale[known, None] / scale[None, known]
+    if not np.isfinite(unit).all():
+        return "is not positive semidefinite: correlations exceed 1"
+    if np.abs(unit - unit.T).max(initial=0.0) > 1e-6:
+        return "is not symmetric"
+    if np.linalg.eigvalsh(unit).min(initial=0.0) < -1e-3:
+        return "is not positive semidefinite: correlations exceed 1"
+    return ""
+
+
 def diagonal(matrices: Float64Array) -> Float64Array:
     """Return the diagonals (n, k) of matrices (n, k, k) as a view that can be written to."""
     view: Float64Array = np.einsum("nii->ni", matrices)

@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.config import FusionConfig
-from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.errors import ConfigError, PoseError
+from crossloc3d_ros.localization.fusion.linear_algebra import why_no_covariance
+from crossloc3d_ros.localization.inputs import check_stamp, float_array
 from crossloc3d_ros.types import Float32Array, Float64Array
 
 _KEPT_NS = 120_000_000_000  # no scan is localized later than that after it was taken
@@ -22,6 +24,8 @@ _TRANSFORMS = 2000  # ten seconds at 200 Hz, far more than a scan takes
 _SCAN_GAP_S = 1.5  # scans farther apart than this share too little to be aligned with each other while driving
 _LEAST_POINTS = 100  # of fewer, KISS-ICP aligns noise
 _STAND_STILL_M = 0.01  # one sigma of a motion's position and, in radians, a tenth of it of its heading: never 0
+_MOST_VARIANCE = 1e6  # of a kilometre, or of more than the circle
+_FARTHEST_M = 1e8  # nothing drives so far from where its odometry began
 _JITTER_S, _JITTER_M = 0.05, 0.05  # by which stamps and poses of a robot at top speed may be off
 
 
@@ -37,6 +41,16 @@ class Motion:
     """False: the odometry reports nothing, or nothing plausible, of this time."""
     reason: str = ""
     """One sentence for people: why it is unknown."""
+
+    def __post_init__(self) -> None:
+        """Refuse, by PoseError, other shapes and what is no covariance; what is not finite is an unknown motion."""
+        delta = float_array(self.delta, (3,), "the motion")
+        covariance = float_array(self.covariance, (3, 3), "the covariance of a motion")
+        why = why_no_covariance(covariance) if np.isfinite(covariance).all() else ""
+        if why:
+            raise PoseError(f"the covariance of a motion {why}: {np.round(covariance, 3).tolist()}")
+        object.__setattr__(self, "delta", delta)
+        object.__setattr__(self, "covariance", covariance)
 
     @property
     def distance_m(self) -> float:
@@ -57,6 +71,10 @@ def plausible_motion(motion: Motion | None, elapsed_s: float, config: FusionConf
         return motion
     if not (np.isfinite(motion.delta).all() and np.isfinite(motion.covariance).all()):
         return unknown_motion("the odometry is not a number")
+    if np.diag(motion.covariance).max() > _MOST_VARIANCE:
+        return unknown_motion("by its covariance the odometry knows nothing")
+    if abs(float(motion.delta[2])) > 10.0 * (math.radians(config.max_turn_deg_per_s) * (elapsed_s + _JITTER_S) + 1.0):
+        return unknown_motion(f"the odometry reports a turn of {motion.delta[2]:.3g} rad in {elapsed_s:.2g} s")
     if motion.distance_m > config.max_speed_mps * (elapsed_s + _JITTER_S) + _JITTER_M:
         return unknown_motion(
             f"the odometry reports {motion.distance_m:.3g} m in {elapsed_s:.2g} s, faster than the robot"
@@ -102,9 +120,11 @@ class OdometryBuffer:
         """Take in one pose (4, 4) of the base, and return whether it can be used.
 
         Late and repeated samples and poses that are none are left out; a stamp that lies back by more than `restart_s`
-        begins anew.
+        begins anew. PoseError for a stamp or numbers that are none.
         """
-        pose = _planar(np.asarray(T_odom_base, dtype=np.float64))
+        check_stamp(stamp_ns, "the stamp of an odometry pose")
+        transform = float_array(T_odom_base, None, "the pose of the odometry")
+        pose = _planar(transform)
         if pose is None:
             self._refused = "the last pose of the odometry is not a pose"
             return False
@@ -117,7 +137,7 @@ class OdometryBuffer:
         self._jumps.append(_impossible(stamps[-1], poses[-1], stamp_ns, pose, self._config) if stamps else "")
         stamps.append(stamp_ns)
         poses.append(pose)
-        self._transforms.append(np.asarray(T_odom_base, dtype=np.float64))
+        self._transforms.append(transform)
         if stamp_ns - stamps[0] > 2 * _KEPT_NS:
             old = bisect.bisect_left(stamps, stamp_ns - _KEPT_NS)
             del stamps[:old], poses[:old], self._jumps[:old]
@@ -280,7 +300,7 @@ def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) 
 
 def _planar(T_odom_base: Float64Array) -> tuple[float, float, float] | None:
     """Return x, y and heading of a pose; None where the matrix (4, 4) is no pose, or stands on its nose."""
-    if T_odom_base.shape != (4, 4) or not np.isfinite(T_odom_base).all():
+    if T_odom_base.shape != (4, 4) or not (np.abs(T_odom_base) < _FARTHEST_M).all():
         return None
     rotation = T_odom_base[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or math.hypot(rotation[0, 0], rotation[1, 0]) < 0.1:

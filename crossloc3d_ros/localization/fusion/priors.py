@@ -10,14 +10,18 @@ import numpy as np
 
 from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.config import FusionConfig
+from crossloc3d_ros.errors import PoseError
 from crossloc3d_ros.localization.fusion.filter import UNKNOWN_HEADING_VARIANCE
-from crossloc3d_ros.localization.fusion.linear_algebra import at_least
+from crossloc3d_ros.localization.fusion.linear_algebra import at_least, why_no_covariance
 from crossloc3d_ros.localization.fusion.mixture import Mixture, new_hypotheses
+from crossloc3d_ros.localization.inputs import check_stamp, float_array
 from crossloc3d_ros.types import Float64Array
 
 LARGEST_STD_M = 150.0
 """A wider hypothesis is no more than that the robot is on the map: it is not tracked."""
 _MIN_STD_M, _MIN_STD_DEG = 0.1, 0.5  # of an initial pose: nobody gives one more exactly
+_FARTHEST_M = 1e8
+_WIDEST_STD = 1e6  # what is wider overflows, and says no less
 _COMPASS_STALE_NS = 1e9  # the robot may have turned since
 _COMPASS_MIN_STD_RAD = math.radians(1.0)  # magnetometers do no better
 _COMPASS_FAULT = 0.1  # one compass in ten stands beside iron
@@ -35,6 +39,25 @@ class PosePrior:
     """(3, 3) of easting, northing, heading: m2, m rad, rad2; infinite where unknown."""
     stamp_ns: int
     """When it held; 0 = now."""
+
+    def __post_init__(self) -> None:
+        """Refuse, by PoseError, what is no prior: it would stay in the belief."""
+        covariance = float_array(self.covariance, (3, 3), "the covariance of a prior")
+        why = why_no_covariance(covariance)
+        if why:
+            raise PoseError(f"the covariance of a prior {why}: {np.round(covariance, 3).tolist()}")
+        object.__setattr__(self, "covariance", covariance)
+        if self.grid is not None:
+            grid = float_array(self.grid, (3,), "the position of a prior")
+            if not (np.abs(grid) <= _FARTHEST_M).all():
+                raise PoseError(f"the position of a prior must be easting, northing, height in metres: {grid.tolist()}")
+            object.__setattr__(self, "grid", grid)
+        if self.heading_rad is not None:
+            heading = float(float_array(self.heading_rad, (), "the heading of a prior"))
+            if not math.isfinite(heading):
+                raise PoseError(f"the heading of a prior must be a number, or None where it is not known: {heading}")
+            object.__setattr__(self, "heading_rad", heading)
+        check_stamp(self.stamp_ns, "the stamp of a prior")
 
 
 class Priors:
@@ -57,7 +80,7 @@ class Priors:
         return [
             _hypothesis(prior, prior.grid, travelled_m if prior.stamp_ns and stamp_ns > prior.stamp_ns else 0.0, config)
             for prior in poses
-            if prior.grid is not None and np.isfinite(prior.grid).all()
+            if prior.grid is not None
         ]
 
     def log_likelihood_ratio(self, heading_rad: Float64Array, stamp_ns: int | None) -> Float64Array:
@@ -77,12 +100,12 @@ class Priors:
 
 def _hypothesis(prior: PosePrior, grid: Float64Array, travelled_m: float, config: FusionConfig) -> Mixture:
     """Return the hypothesis of an initial pose; it may have moved by up to `travelled_m` since."""
-    covariance = np.array(prior.covariance, dtype=np.float64)
-    heading = prior.heading_rad if prior.heading_rad is not None and math.isfinite(prior.heading_rad) else None
+    covariance, heading = prior.covariance.copy(), prior.heading_rad
     if heading is None or not np.isfinite(covariance[2]).all():
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = UNKNOWN_HEADING_VARIANCE
-    covariance = np.nan_to_num(covariance, nan=0.0, posinf=LARGEST_STD_M**2, neginf=0.0)
+    covariance = np.nan_to_num(covariance, posinf=LARGEST_STD_M**2)
+    covariance *= np.outer(*2 * [np.minimum(1.0, _WIDEST_STD / np.sqrt(np.maximum(np.diag(covariance), 1e-12)))])
     covariance[:2, :2] += np.eye(2) * travelled_m**2
     born = new_hypotheses(
         grid[None], np.array([heading or 0.0]), at_least(covariance[None], _MIN_STD_M, _MIN_STD_DEG),

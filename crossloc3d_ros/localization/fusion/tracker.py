@@ -25,8 +25,9 @@ from crossloc3d_ros.localization.fusion.filter import predict, predict_unknown
 from crossloc3d_ros.localization.fusion.linear_algebra import diagonal
 from crossloc3d_ros.localization.fusion.mixture import POSITION, merge, no_mixture
 from crossloc3d_ros.localization.fusion.null_hypothesis import NullHypothesis, complement, normalize
-from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion
+from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion, unknown_motion
 from crossloc3d_ros.localization.fusion.priors import LARGEST_STD_M, PosePrior, Priors
+from crossloc3d_ros.localization.inputs import check_stamp
 from crossloc3d_ros.types import AlignedPoses, Hypotheses, TrackState
 
 
@@ -47,6 +48,11 @@ class Tracker:
         """Whether the scan given to `predict` changes nothing: it is late, or a repeated one."""
         return bool(self._skipped)
 
+    @property
+    def motion(self) -> Motion:
+        """The motion that the last `predict` took for plausible; unknown where there was none."""
+        return self._motion
+
     def reconfigure(self, config: FusionConfig) -> None:
         """Use other settings from the next scan on; the hypotheses are kept."""
         self._config = config
@@ -58,6 +64,7 @@ class Tracker:
         self._null = NullHypothesis()
         self._priors = Priors()
         self._decision = FixDecision()
+        self._motion = unknown_motion("no scan yet")
         self._travelled_m: float | None = None  # distance since the last update; None = unknown
         self._skipped = ""
         self._belief = no_belief(TrackState.SEARCHING, "no scan yet")
@@ -75,7 +82,9 @@ class Tracker:
 
         `motion` leads from the last scan that counted (`stamp_ns` of this object) to this one; None = unknown. A
         repeated or late stamp changes nothing; one that lies back by more than `restart_s` forgets everything.
+        PoseError for what is no stamp.
         """
+        check_stamp(stamp_ns, "the stamp of a scan")
         self._skipped = ""
         if self._stamp_ns is not None:
             elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
@@ -121,6 +130,7 @@ class Tracker:
         return self._belief
 
     def _move(self, motion: Motion, elapsed_s: float) -> None:
+        self._motion = motion
         self._decision.add_motion(motion)
         self._null = self._null.predict(elapsed_s, motion.is_known, self._config)
         if motion.is_known:

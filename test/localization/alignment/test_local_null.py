@@ -13,7 +13,7 @@ import pytest
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.localization.alignment.evidence import LAYERS, Evidence, evidence_of
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
-from crossloc3d_ros.localization.alignment.local_null import EXPLAINED_BOUNDS, SECTORS, measures
+from crossloc3d_ros.localization.alignment.local_null import EXPLAINED_BOUNDS, SECTORS, measures, with_behind_best
 from crossloc3d_ros.localization.alignment.observation_model import MEASURES, UNKNOWN, ObservationModel
 from crossloc3d_ros.localization.alignment.pose_search import scores_at
 from crossloc3d_ros.localization.alignment.surroundings import SHIFTED, SPUN, TURNED
@@ -45,7 +45,8 @@ def poses_near_and_far(seed: int = 0, count: int = 6) -> Float64Array:
 
 
 def measured(evidence: Evidence, sample: Evidence, likelihood: MapLikelihood, poses: Float64Array) -> Float64Array:
-    return measures(evidence, sample, scores_at(evidence, likelihood, poses), likelihood, poses)
+    scores = scores_at(evidence, likelihood, poses)
+    return with_behind_best(measures(evidence, sample, scores, likelihood, poses), scores, len(evidence))
 
 
 def cells_at(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Array) -> list[tuple[int, int, int]]:
@@ -83,7 +84,7 @@ def above_by_hand(evidence: Evidence, likelihood: MapLikelihood, pose: Float64Ar
         (score - np.mean([sums[sector] for sums in around])) / max(deviations[sector], least)
         for sector, score in own.items()
     ]
-    return math.log(max(float(np.mean(above)), 0.1))
+    return math.log(min(max(float(np.mean(above)), 0.1), math.e))
 
 
 def test_measures_are_those_by_hand(likelihood: MapLikelihood, evidence: Evidence) -> None:
@@ -91,18 +92,22 @@ def test_measures_are_those_by_hand(likelihood: MapLikelihood, evidence: Evidenc
     poses = poses_near_and_far(count=3)
     found = measured(evidence, sample, likelihood, poses)
     assert found.shape == (len(poses), len(MEASURES))
-    for row, pose in zip(found, poses, strict=True):
+    scores = scores_at(evidence, likelihood, poses)
+    for row, pose, score in zip(found, poses, scores.tolist(), strict=True):
         by_hand = [
             explained_by_hand(evidence, likelihood, pose),
             above_by_hand(sample, likelihood, pose, SHIFTED),
             above_by_hand(sample, likelihood, pose, SPUN),
+            math.log(min(len(evidence) / 3000, 1.0)),
+            -math.sqrt(min((max(scores) - score) / (0.25 * len(evidence)), 0.6)),
         ]
         np.testing.assert_allclose(row, by_hand, atol=2e-3)
 
 
 def test_the_true_pose_is_above_all_others_in_every_measure(likelihood: MapLikelihood, evidence: Evidence) -> None:
     found = measured(evidence, evidence.sample(600, 700), likelihood, poses_near_and_far(count=40))
-    assert (found[0] > found[1:].max(axis=0)).all()
+    of_its_own = np.arange(len(MEASURES)) != MEASURES.index("amount")
+    assert (found[0] > found[1:].max(axis=0))[of_its_own].all()
     assert likelihood.model.log_likelihood(found)[0] > 8.0
     assert likelihood.model.log_likelihood(found)[1:].max() < 0.0
 
@@ -115,6 +120,16 @@ def test_surroundings_are_no_pose_of_the_peak() -> None:
         np.testing.assert_allclose(offsets[:, :2].sum(axis=0), 0.0, atol=1e-9)
 
 
+def test_few_cells_count_less_and_more_than_enough_count_no_more(likelihood: MapLikelihood, evidence: Evidence) -> None:
+    poses = poses_near_and_far(count=2)
+    some = evidence.sample(100, 150)
+    amounts = [measured(cells, some, likelihood, poses)[:, 3] for cells in (some, evidence.sample(200, 300))]
+    np.testing.assert_allclose(amounts[1] - amounts[0], math.log(2.0))
+    many = Evidence(np.tile(evidence.xy_m, (20, 1)), np.tile(evidence.channel, 20))
+    assert len(many) > 3000
+    assert not measured(many, some, likelihood, poses)[:, 3].any()
+
+
 def test_what_every_place_explains_is_no_evidence(likelihood: MapLikelihood, evidence: Evidence) -> None:
     """A map of one class: a scan fits it anywhere, however well."""
     class_ = int(np.argmax(likelihood.model.log_ratios.sum(axis=0)))
@@ -122,7 +137,7 @@ def test_what_every_place_explains_is_no_evidence(likelihood: MapLikelihood, evi
     uniform.classes = np.full_like(likelihood.classes, class_)
     poses = poses_near_and_far()
     found = measured(evidence, evidence.sample(600, 700), uniform, poses)
-    np.testing.assert_allclose(found[:, 1:], math.log(0.1), err_msg="nothing stands out")
+    np.testing.assert_allclose(found[:, 1:3], math.log(0.1), err_msg="nothing stands out")
     assert (likelihood.model.log_likelihood(found) < -10.0).all()
 
 

@@ -121,3 +121,14 @@ def test_what_wrong_hypotheses_reach_scan_after_scan_is_no_evidence(worlds: Any)
     assert driven(worlds, 7.0, 0.0) > 0.999
     assert driven(worlds, 7.0, 9.0) < 0.5
     assert driven(worlds, 20.0, 9.0) > 0.999, "what is above still counts"
+
+
+def test_what_wrong_hypotheses_reach_says_nothing_for_a_robot_that_was_carried_away(worlds: Any) -> None:
+    """Evidence just above the null hypothesis keeps a belief as certain as it became, at a spot and along the way."""
+    config = dataclasses.replace(worlds.CONFIG, null_log_likelihood=9.0, kidnapping_per_s=1e-3)
+    tracker, probabilities = Tracker(config), []
+    for k, fits in enumerate([20.0] * 60 + [10.0] * 200):
+        motion = Motion(worlds.AHEAD * (k < 160), motion_covariance(1.0, 0.0, config))
+        tracker.predict(k * worlds.SECOND // 10, motion if k else None)
+        probabilities.append(tracker.update(worlds.aligned_at([(min(k, 159), 0, 0)], [fits])).probability)
+    assert min(probabilities[60:]) > 0.999
