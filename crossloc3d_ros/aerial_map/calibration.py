@@ -22,7 +22,7 @@ from crossloc3d_ros.files import write_atomically
 CALIBRATION = "localizability.json"
 FORMAT, FORMAT_VERSION = "crossloc3d localizability", 1
 LARGEST_OFFSET = 50.0
-"""Beyond this, an offset says nothing but that the file is damaged."""
+"""Nats; beyond this below 0, an offset says nothing but that the file is damaged."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class MapCalibration:
     """What the log likelihoods of scans mean on one map with one lidar."""
 
     offset: float
-    """Nats, added to the log likelihood of every aligned pose."""
+    """Nats, 0 or less, added to the log likelihood of every aligned pose."""
     unlimited_offset: float
-    """The same without the limit that scans off the map set."""
+    """The same without its limits: 0, and what scans off the map allow."""
     offset_std: float
     """Standard deviation of `unlimited_offset`, nats."""
     off_map_belief: float
@@ -118,8 +118,8 @@ def read_calibration(folder: Path, manifest_sha256: str) -> MapCalibration | Non
 
 def _check(calibration: MapCalibration) -> None:
     """Raise ConfigError for numbers that no calibration has."""
-    if not abs(calibration.offset) <= LARGEST_OFFSET:
-        raise ConfigError(f"'offset' must lie within {LARGEST_OFFSET:g} nats of 0, got {calibration.offset}")
+    if not -LARGEST_OFFSET <= calibration.offset <= 0.0:
+        raise ConfigError(f"'offset' must lie between -{LARGEST_OFFSET:g} and 0 nats, got {calibration.offset}")
     if not (math.isfinite(calibration.unlimited_offset) and 0.0 <= calibration.offset_std < math.inf):
         raise ConfigError("'unlimited_offset' and 'offset_std' must be finite")
     if not 0.0 <= calibration.off_map_belief <= 1.0:

@@ -40,9 +40,9 @@ class FittedOffset:
     """The offset, and what limits it."""
 
     offset: float
-    """Nats, to be added to log likelihoods."""
+    """Nats, to be added to log likelihoods; never above 0."""
     unlimited: float
-    """The most probable one of the conditional logit with its prior, whatever scans off the map are believed then."""
+    """The most probable one of the conditional logit with its prior, without these limits."""
     std: float
     """Standard deviation of `unlimited`, nats."""
     off_map_belief: float
@@ -57,9 +57,10 @@ def odds_of(aligned: AlignedPoses) -> float:
 
 
 def fit_offset(scans: Sequence[ScanOdds]) -> FittedOffset:
-    """Return the most probable offset, lowered until no scan off the map is believed above `MOST_OFF_MAP`.
+    """Return the most probable offset, but none above 0, lowered until no stranger is believed above `MOST_OFF_MAP`.
 
-    Scans on the map and off it count the same together, as the prior of the localizer has it.
+    Scans on the map and off it count the same together, as the prior of the localizer has it. Simulated scans of a
+    map's own surface fit it better than real ones will: that they stand out is no reason to believe more.
     """
     log_odds, right, weight = _columns(scans)
 
@@ -76,7 +77,7 @@ def fit_offset(scans: Sequence[ScanOdds]) -> FittedOffset:
     std = 1.0 / math.sqrt(float(weight @ (belief * (1.0 - belief))) + PRIOR_STD**-2)
     strangers = [scan.log_odds for scan in scans if not scan.on_map]
     likest = max(strangers, default=-math.inf)
-    offset = min(unlimited, math.log(MOST_OFF_MAP / (1.0 - MOST_OFF_MAP)) - likest)
+    offset = min(unlimited, 0.0, math.log(MOST_OFF_MAP / (1.0 - MOST_OFF_MAP)) - likest)
     return FittedOffset(offset, unlimited, std, float(expit(likest + offset)))
 
 

@@ -141,6 +141,11 @@ def page_text(
 def limit_words(calibration: MapCalibration) -> str:
     """Return the sentence that says where the offset comes from."""
     fitted = f"{calibration.unlimited_offset:+.2f} ± {calibration.offset_std:.2f}"
+    if calibration.offset == 0.0:
+        return (
+            f"The most probable offset, {fitted}, would raise the belief. Simulated scans fit the map that they are "
+            "made of better than real ones, so it is left at 0; no scan off the map is believed above 99 %."
+        )
     if calibration.offset < calibration.unlimited_offset:
         return (
             f"The most probable offset, {fitted}, is lowered to {calibration.offset:+.2f}, so that no scan off the map "

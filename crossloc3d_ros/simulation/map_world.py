@@ -30,6 +30,7 @@ _OPEN_M, _GRASS_M = 0.4, 1.0  # lower is open ground; lower by itself is too
 _ROOF_M = 2.2  # lower is no roof
 _FLAT_M = 1.6  # from the lowest to the highest echo of a cell of a roof, however steep
 _LEAST_ROOF_M2 = 20.0
+_GAP_CELLS = 2  # twice as wide gaps between echoes, as sparse surveys have them, hold what is beside them
 _ECHOES = 4  # of a cell with something loose in it, where the map does not tell how many there were
 _MOST_ECHOES = 4
 _HOUSE_M = 20.0
@@ -119,13 +120,23 @@ def _local(bounds: tuple[float, float, float, float], origin: Float64Array) -> t
 
 def _read(aerial_map: AerialMap, window: tuple[float, float, float, float], terrain: Raster) -> _Layers:
     ground = terrain.values.astype(np.float64)
-    above = aerial_map.surface(window).values - ground
-    lowest = aerial_map.lowest(window).values - ground
+    above = _bridged(aerial_map.surface(window).values - ground)
+    lowest = _bridged(aerial_map.lowest(window).values - ground)
     support = aerial_map.support(window)
     echoes = np.full(ground.shape, _ECHOES)
     if support is not None:
         echoes = np.clip(support.values, 1, _MOST_ECHOES).astype(np.int64)
     return _Layers(ground, above, lowest, echoes, _roofs(above, lowest, terrain.cell_m))
+
+
+def _bridged(heights: Float64Array) -> Float64Array:
+    """Return heights (H, W) whose narrow gaps hold the nearest echo: with holes in it, no roof is told from a crown."""
+    known = np.isfinite(heights)
+    if not known.any():
+        return heights
+    closed = ndimage.binary_closing(known, iterations=_GAP_CELLS)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.where(closed & ~known, heights[tuple(nearest)], heights)
 
 
 def _roofs(above: Float64Array, lowest: Float64Array, cell_m: float) -> BoolArray:

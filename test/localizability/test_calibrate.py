@@ -18,7 +18,7 @@ from crossloc3d_ros.clouds.raster import Raster
 from crossloc3d_ros.config import LocalizabilityConfig, LocalizerConfig
 from crossloc3d_ros.errors import ConfigError, MapError
 from crossloc3d_ros.localizability.calibrate import calibrate_map
-from crossloc3d_ros.localizability.page import PAGE
+from crossloc3d_ros.localizability.page import PAGE, limit_words
 from crossloc3d_ros.localizability.raster import CELL_M, NEVER, RASTER, distance_class
 from crossloc3d_ros.localizability.squares import SIDE_M, choose_squares, divided
 from crossloc3d_ros.localization.localizer import Localizer
@@ -73,6 +73,19 @@ def test_the_page_needs_nothing_else_and_says_what_was_done(calibrated: Any) -> 
     for words in ("at once", "within 20 m", "within 100 m", "not within 100 m", "Twin streets", "N ↑", "vlp-16"):
         assert words in page
     assert page.count("<title>") == 1 + len(calibrated.found.places)
+
+
+@pytest.mark.parametrize(
+    ("offset", "unlimited", "words"),
+    [
+        (0.0, 2.4, "+2.40 ± 0.50, would raise the belief"),
+        (-3.0, -1.0, "-1.00 ± 0.50, is lowered to -3.00"),
+        (-1.0, -1.0, "the most probable one, -1.00 ± 0.50"),
+    ],
+)
+def test_the_page_says_what_limits_the_offset(calibrated: Any, offset: float, unlimited: float, words: str) -> None:
+    made = calibrated.found.calibration
+    assert words in limit_words(dataclasses.replace(made, offset=offset, unlimited_offset=unlimited, offset_std=0.5))
 
 
 def test_a_calibration_of_a_map_that_was_built_again_is_left_aside(calibrated: Any, tmp_path: Path) -> None:

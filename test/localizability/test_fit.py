@@ -46,16 +46,18 @@ def test_no_stranger_is_believed_and_nothing_else_lowers_belief(
 ) -> None:
     fitted = fit_offset(scans_of(on_map, off_map))
     assert fitted.off_map_belief <= MOST_OFF_MAP + 1e-9
-    assert fitted.offset <= fitted.unlimited
-    assert fitted.offset == fitted.unlimited or fitted.off_map_belief == pytest.approx(MOST_OFF_MAP)
+    assert fitted.offset <= min(fitted.unlimited, 0.0)
+    assert fitted.offset == min(fitted.unlimited, 0.0) or fitted.off_map_belief == pytest.approx(MOST_OFF_MAP)
+    before = 1.0 / (1.0 + math.exp(-max(off_map)))
+    assert fitted.off_map_belief <= before + 1e-12
 
 
 def test_strangers_that_are_believed_lower_the_offset() -> None:
-    known = [(9.0, True)] * 30
-    trusting, wary = fit_offset(scans_of(known, [-6.0] * 30)), fit_offset(scans_of(known, [3.0] * 30))
-    assert wary.offset < -1.0 < trusting.offset
+    known = [(4.0, True)] * 30
+    trusting, wary = fit_offset(scans_of(known, [-9.0] * 30)), fit_offset(scans_of(known, [3.0] * 30))
+    assert wary.offset < -1.0 and trusting.offset == 0.0 < trusting.unlimited
     before, after = (1.0 / (1.0 + math.exp(-(3.0 + offset))) for offset in (0.0, wary.offset))
-    assert before > 0.9 and after < 0.5
+    assert before > 0.9 and after < 0.6
 
 
 def test_without_evidence_the_prior_decides() -> None:

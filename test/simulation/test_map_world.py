@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -42,6 +45,29 @@ def test_the_world_is_as_high_as_the_map(town_map: AerialMap, square: Bounds, wo
     high, low = known & (surface - terrain > 3.0), known & (surface - terrain < 0.3)
     assert np.mean(labels[high] == Label.BUILDING) > 0.8
     assert np.mean(labels[low] == Label.GROUND) > 0.95
+
+
+def test_houses_of_a_sparse_survey_are_houses(
+    town_map: AerialMap, square: Bounds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cells in five have no echo: roofs are still told from crowns, and nobody drives through them."""
+    full, rng = town_map.surface(), np.random.default_rng(3)
+    places = rng.uniform([square.min_x, square.min_y], [square.max_x, square.max_y], (4000, 2))
+    high = full.nearest(*places.T) - town_map.terrain().nearest(*places.T) > 3.0
+
+    def thinned(read: Any) -> Any:
+        def with_gaps(self: AerialMap, bounds: Any = None) -> Any:
+            raster = read(self, bounds)
+            gaps = np.random.default_rng(4).random(raster.values.shape) < 0.4
+            return dataclasses.replace(raster, values=np.where(gaps, np.float32(np.nan), raster.values))
+
+        return with_gaps
+
+    for name in ("surface", "lowest"):
+        monkeypatch.setattr(AerialMap, name, thinned(getattr(AerialMap, name)))
+    sparse = world_of_map(town_map, square, 0, UNCHANGED)
+    _, labels = seen_from_above(sparse, places - sparse.origin_grid[:2])
+    assert np.mean(labels[high] == Label.BUILDING) > 0.75
 
 
 def test_robots_drive_on_open_ground_inside_of_the_square(town_map: AerialMap, square: Bounds, world: World) -> None:
