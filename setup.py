@@ -17,6 +17,7 @@ except ImportError:  # an older setuptools, as colcon finds it on Ubuntu 24.04: 
 NAME = "crossloc3d_ros"
 COMMANDS = [
     "build_map",
+    "calibrate_map",
     "compare",
     "cut_survey",
     "demo",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -73,6 +73,27 @@ def write_geotiff(
         raise OSError(f"{path} could not be written: {error}") from error
     if found != checksum:
         raise OSError(f"{path} was not written whole; is the disk full?")
+
+
+def write_bands(path: Path, rasters: Mapping[str, Raster], crs: str) -> None:
+    """Write rasters of one grid as the bands of one file, float32, NaN where nothing is known, with their names.
+
+    Raises OSError where that fails.
+    """
+    grid = next(iter(rasters.values()))
+    height, width = grid.values.shape
+    profile = {
+        "driver": "GTiff", "count": len(rasters), "width": width, "height": height, "crs": crs, "dtype": "float32",
+        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m), "nodata": float("nan"),
+        "compress": "deflate", "predictor": 3,
+    }  # fmt: skip
+    try:
+        with rasterio.open(path, "w", **profile) as file:
+            for band, (description, raster) in enumerate(rasters.items(), start=1):
+                file.write(raster.values.astype(np.float32), band)
+                file.set_band_description(band, description)
+    except RasterioError as error:
+        raise OSError(f"{path} could not be written: {error}") from error
 
 
 def _as_stored(values: Float32Array, kind: Literal["heights", "counts"]) -> tuple[Float32Array | UInt16Array, bool]:

@@ -7,6 +7,8 @@ terrain.tif        the ground as GeoTIFF, holes filled
 surface.tif        the highest point of each cell as GeoTIFF
 lowest.tif         the lowest point of each cell as GeoTIFF: whether pulses got through to the ground
 support.tif        the number of points of each cell as GeoTIFF; maps of before this file was written lack it
+
+Beside them may lie what `localizability` leaves: see `aerial_map.calibration`.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from crossloc3d_ros.aerial_map.calibration import MapCalibration, manifest_digest, read_calibration
 from crossloc3d_ros.aerial_map.consistency import check_echoes, check_placement, check_submaps
 from crossloc3d_ros.aerial_map.coverage import Coverage
 from crossloc3d_ros.aerial_map.descriptor_map import DescriptorMap
@@ -147,6 +150,10 @@ class AerialMap:
     lowest_path: Path = field(default_factory=Path)
     support_path: Path | None = None
     """None where the map has no such file."""
+    calibration: MapCalibration | None = None
+    """What log likelihoods mean on it; None where it was not calibrated, or the calibration cannot be used."""
+    calibration_fault: str = ""
+    """Why the calibration in its folder cannot be used; empty where there is none, or nothing is wrong with it."""
 
     @property
     def bounds(self) -> Bounds:
@@ -200,7 +207,7 @@ class AerialMap:
         frame = MapFrame(manifest.crs, np.array(manifest.origin), manifest.geoid_separation_m)
         support = folder / SUPPORT if any(record.name == SUPPORT for record in manifest.files) else None
         rasters = (folder / TERRAIN, folder / SURFACE, folder / LOWEST, support)
-        opened = cls(folder, manifest, frame, submaps, index, *rasters)
+        opened = cls(folder, manifest, frame, submaps, index, *rasters, *_calibration_of(folder))
         opened._check()
         return opened
 
@@ -212,6 +219,14 @@ class AerialMap:
         check_placement(self.path, manifest.crs, self.bounds, manifest.build.cell_m, manifest.origin, rasters)
         check_submaps(self.path, grid, self.bounds, manifest.preprocessing.half_extent_m, self.terrain_path)
         check_echoes(self.path, grid, self.surface_path, self.lowest_path, self.support_path)
+
+
+def _calibration_of(folder: Path) -> tuple[MapCalibration | None, str]:
+    """Return the calibration of a map, or why the one in its folder is left aside."""
+    try:
+        return read_calibration(folder, manifest_digest(folder / MANIFEST)), ""
+    except MapError as error:
+        return None, str(error)
 
 
 def read_manifest(folder: Path) -> Manifest:

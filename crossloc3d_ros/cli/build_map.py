@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,10 +23,14 @@ from crossloc3d_ros.cli.common import (
     run,
     set_up_logging,
 )
-from crossloc3d_ros.config import BuildConfig
+from crossloc3d_ros.config import BuildConfig, LocalizabilityConfig
 from crossloc3d_ros.encoder.checkpoint import load_encoder
+from crossloc3d_ros.errors import ConfigError
 from crossloc3d_ros.geodesy import MapFrame, crs_name
 from crossloc3d_ros.placement import datum_warnings, datum_words, place_words, unit_name, unit_of
+
+_CALIBRATION_OPTIONS = ("lidar", "lidar_height_m", "places", "off_map_scans", "seed")
+"""Of `calibrate_map`; the workers are those of the build."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,12 +57,17 @@ def _parser() -> argparse.ArgumentParser:
         help="ellipsoidal height minus the survey's height; without it fixes carry no altitude",
     )  # fmt: skip
     add_options(parser, BuildConfig)
+    parser.add_argument(
+        "--calibrate", action="store_true", help="then calibrate the map as calibrate_map does, for the lidar given"
+    )
+    add_options(parser, LocalizabilityConfig, _CALIBRATION_OPTIONS)
     add_verbosity(parser)
     return parser
 
 
 def _build(arguments: argparse.Namespace) -> None:
     config = read_options(BuildConfig, arguments)
+    calibration = _calibration_of(arguments, config)
     target = console()
     set_up_logging(arguments.verbose, target)
     one_thread_each = config.workers > 1 or arguments.scheduler is not None
@@ -76,7 +86,25 @@ def _build(arguments: argparse.Namespace) -> None:
             overwrite=arguments.overwrite,
             progress=lambda p: display(p.stage, p.done, p.total, p.unit),
         )
-    print(summary(report))
+        print(summary(report))
+        if calibration is not None:
+            from crossloc3d_ros.cli.calibrate_map import calibrate_and_sum_up
+
+            print(calibrate_and_sum_up(arguments.output, loader, calibration, display))
+
+
+def _calibration_of(arguments: argparse.Namespace, config: BuildConfig) -> LocalizabilityConfig | None:
+    """Return how the map is to be calibrated, if at all; ConfigError for options that do nothing or cannot be."""
+    given = [name for name in _CALIBRATION_OPTIONS if getattr(arguments, name) is not None]
+    if not arguments.calibrate:
+        if given:
+            raise ConfigError(f"--{given[0].replace('_', '-')} is of use with --calibrate alone")
+        return None
+    calibration = read_options(LocalizabilityConfig, arguments)
+    from crossloc3d_ros.localizability.driving import Sensor  # what simulates is not needed to build
+
+    Sensor(calibration)  # an unknown lidar is reported before the build, not after it
+    return dataclasses.replace(calibration, workers=config.workers)
 
 
 def summary(report: BuildReport) -> str:

@@ -124,6 +124,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         encoder = load_encoder(weights, device=config.device, threads=config.threads or None)
         aerial_map = AerialMap.load(config.map, encoder.fingerprint)
         localizer = Localizer(aerial_map, encoder, config, threads=config.threads)
+        if localizer.calibration_words:
+            target.print(f"the map: {localizer.calibration_words}")
         remove_results(folder)
         moved = odometry_words(odometry)
         target.print(f"warming up, then localizing '{topic}' on {len(aerial_map.submaps):,} submaps; odometry: {moved}")

@@ -6,6 +6,7 @@ the traffic, so that moving these classes would make every benchmark anew. `Driv
 """
 
 from crossloc3d_ros.config.aerial_map import BuildConfig
+from crossloc3d_ros.config.localizability import LocalizabilityConfig
 from crossloc3d_ros.config.localizer import (
     AlignmentConfig,
     FusionConfig,
@@ -39,6 +40,7 @@ __all__ = [
     "DatasetConfig",
     "FusionConfig",
     "HeightMapConfig",
+    "LocalizabilityConfig",
     "LocalizerConfig",
     "LocalizerNodeConfig",
     "ModelConfig",

@@ -125,6 +125,9 @@ class AlignmentConfig:
         high=200.0,
     )
     min_cells: int = option(100, "a scan with evidence in fewer cells is not aligned", low=1, high=100_000)
+    use_calibration: bool = option(
+        True, "shift log likelihoods by the offset that calibrate_map left in the map's folder, where there is one"
+    )
     place_m2: float = option(
         100.0, "area of one place: its share of the map's area is the prior of a pose", low=0.01, high=1e6
     )

@@ -62,6 +62,16 @@ class Localizer:
         """Stamp of the last scan that counted, from which the next one's motion leads; None before the first."""
         return self._tracker.stamp_ns
 
+    @property
+    def searches_map(self) -> bool:
+        """Whether the whole map is ever searched for the pose of a scan."""
+        return self._aligner is not None and self._aligner.searches_map
+
+    @property
+    def calibration_words(self) -> str:
+        """A sentence on the map's calibration; empty where there is none, or no pose is aligned."""
+        return "" if self._aligner is None else self._aligner.calibration_words
+
     def localize(
         self,
         scan: Scan,

@@ -167,6 +167,17 @@ class LocalizerNode(LifecycleNode):
             f"origin {origin.latitude:.6f}, {origin.longitude:.6f}; "
             f"weights {localizer.encoder.fingerprint[:12]}; loaded in {time.monotonic() - started:.1f} s"
         )
+        self._log_calibration(localizer)
+
+    def _log_calibration(self, localizer: Localizer) -> None:
+        """Say what the belief on this map is calibrated for: whether that is this robot's lidar, a node cannot know."""
+        words = localizer.calibration_words
+        if not words:
+            self.get_logger().info("the map is not calibrated: 'calibrate_map' finds what scores mean on it")
+        elif localizer.aerial_map.calibration is None:
+            self.get_logger().warning(f"the map: {words}")
+        else:
+            self.get_logger().info(f"the map: {words}")
 
     def _activate(self) -> None:
         parts = self._parts
@@ -267,6 +278,7 @@ class LocalizerNode(LifecycleNode):
         if parts is not None:
             values["submaps"] = str(len(parts.localizer.aerial_map.submaps.grid))
             values["encoder"] = parts.localizer.encoder.fingerprint
+            values["calibration"] = parts.localizer.calibration_words or "none"
             if parts.initial_pose.result:
                 values["initial pose"] = parts.initial_pose.result
         if parts is None or not self._subscriptions_of_parts:

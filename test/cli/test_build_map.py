@@ -62,6 +62,8 @@ def test_a_map_and_what_it_came_to(
         (["{survey}", "--weights", "nowhere.safetensors"], "nowhere.safetensors"),
         (["{survey}", "--spacing-m", "0"], "'spacing_m' must lie between"),
         (["{survey}", "--crs", "EPSG:1"], "EPSG:1"),
+        (["{survey}", "--lidar-height-m", "1.8"], "--lidar-height-m is of use with --calibrate alone"),
+        (["{survey}", "--calibrate", "--lidar", "vlp-17"], "unknown lidar 'vlp-17'"),
     ],
 )
 def test_errors_are_one_line_and_code_2(

@@ -39,6 +39,7 @@ class StandIn:
     def __init__(self, aerial_map: AerialMap, encoder: Any, config: LocalizerNodeConfig) -> None:
         self.aerial_map, self.encoder, self.config = aerial_map, encoder, config
         self.calibration = effective_calibration(config.retrieval, encoder)
+        self.calibration_words = ""
         self.prior: Any = None
         self.resets = 0
         self.stamp_ns: int | None = None

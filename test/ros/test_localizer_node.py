@@ -454,6 +454,7 @@ def test_the_diagnostics_report_what_the_node_works_with(active: Robot, world: W
     assert values["map"] == str(world.map_path)
     assert values["submaps"] == "30"
     assert len(values["encoder"]) == 16
+    assert values["calibration"] == "none"
     assert values["motion within a turn"] == "not compensated: field 'time' gives all points the same time"
     assert 0 < float(values["latency median (ms)"]) <= float(values["latency max (ms)"])
     level, _, _ = active.diagnosis("no cloud on /points for")

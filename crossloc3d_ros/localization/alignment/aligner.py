@@ -94,6 +94,7 @@ class Aligner:
     def reconfigure(self, config: AlignmentConfig) -> None:
         """Use other settings from the next scan on; what was read of the map is kept."""
         self.config = config
+        self.offset, self.calibration_words = calibration_offset(self.aerial_map, self.model, config)
         self.log_prior = -math.log(max(self.area_m2 / config.place_m2, 1.0))
 
     @property
@@ -164,6 +165,26 @@ class Aligner:
         easting, northing = poses[:, 0] + self.likelihood.west_m, poses[:, 1] + self.likelihood.south_m
         heights = [self.likelihood.terrain_height(float(e), float(n)) for e, n in zip(easting, northing, strict=True)]
         return np.column_stack([easting, northing, heights])
+
+
+def calibration_offset(aerial_map: AerialMap, model: ObservationModel, config: AlignmentConfig) -> tuple[float, str]:
+    """Return what is added to log likelihoods on a map, nats, and a sentence on its calibration for people.
+
+    The sentence is empty where the map was never calibrated.
+    """
+    calibration = aerial_map.calibration
+    if calibration is None:
+        fault = aerial_map.calibration_fault
+        return 0.0, f"its calibration is not used: {fault}" if fault else ""
+    made_for = f"for a {calibration.lidar} at {calibration.lidar_height_m:g} m"
+    if not config.use_calibration:
+        return 0.0, f"its calibration {made_for} is not used: alignment.use_calibration is false"
+    if calibration.observation_model != model.fingerprint:
+        return 0.0, (
+            f"its calibration {made_for} is not used: it was made with another observation model; calibrate the "
+            f"map again with 'calibrate_map {aerial_map.path}'"
+        )
+    return calibration.offset, f"calibrated {made_for}: {calibration.offset:+.2f} on log likelihoods"
 
 
 class Alignment:
@@ -280,7 +301,7 @@ class Alignment:
         measured = with_behind_best(poses.measures, poses.scores, len(self._fine))
         log_likelihood = self._aligner.model.log_likelihood(measured)
         log_likelihood = np.minimum(log_likelihood, self._of_newest(poses, log_likelihood) + _BEYOND_NEWEST)
-        log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses)
+        log_likelihood = log_likelihood + self._descriptor_log_ratios(poses.poses) + self._aligner.offset
         order = np.argsort(-log_likelihood, kind="stable")
         poses, measured, log_likelihood = poses.take(order), measured[order], log_likelihood[order]
         log_odds = log_likelihood + self._aligner.log_prior

@@ -15,6 +15,7 @@ v and w the shares of the class among all cells seen. This refutes poses whose b
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,6 +91,14 @@ class ObservationModel:
         q = self.hit_share[:, None]
         p = expit(logit(q) + hit - free)
         return (p * hit + (1.0 - p) * free).astype(np.float32), (q * hit + (1.0 - q) * free).astype(np.float32)
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Identify the model: 16 hexadecimal digits that change with any of its numbers."""
+        digest = hashlib.sha256()
+        for name in _TENSORS:
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return digest.hexdigest()[:16]
 
     def save(self, path: Path) -> None:
         """Write the model to a file."""
