@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.config import LocalizabilityConfig, LocalizerConfig, MountingConfig
 from crossloc3d_ros.errors import ConfigError
+from crossloc3d_ros.evaluation.poses.errors import right_aligned
 from crossloc3d_ros.localizability.fit import MOST_OFF_MAP
 from crossloc3d_ros.localization.fusion.decision import RIGHT_WITHIN_M
+from crossloc3d_ros.localization.fusion.odometry import planar_pose
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import Session
 from crossloc3d_ros.simulation.drive import DriveConfig
@@ -26,12 +27,10 @@ from crossloc3d_ros.simulation.lidar import Lidar
 from crossloc3d_ros.simulation.profiles import PROFILES
 from crossloc3d_ros.simulation.route import Route, RouteError, plan_route
 from crossloc3d_ros.simulation.world import World
-from crossloc3d_ros.types import BoolArray, Estimate, FixStatus, Float64Array, Scan
+from crossloc3d_ros.types import Estimate, FixStatus, Float64Array, Scan
 
 FAR_M, NEAR_M = 100.0, 20.0
 """How far a drive goes at most, and what "soon" means."""
-RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
-"""A pose is the right one of a scan within these."""
 SCAN_EVERY_M = 4.0
 _LEAST_RIVAL = 0.02  # probability: what is less is no place that a scan is taken for
 _SPEED_M_S = 2.0
@@ -132,13 +131,6 @@ def grid_pose(T_world_base: Float64Array, world: World) -> Float64Array:
     return np.array([place[0], place[1], math.atan2(T_world_base[1, 0], T_world_base[0, 0])])
 
 
-def is_right(estimate: Estimate, truth: Float64Array) -> BoolArray:
-    """Return which aligned poses (p,) of an estimate are the true one (3,)."""
-    aligned = estimate.aligned
-    off = np.hypot(aligned.grid[:, 0] - truth[0], aligned.grid[:, 1] - truth[1])
-    return np.asarray((off <= RIGHT_M) & (np.abs(wrap(aligned.heading_rad - truth[2])) <= RIGHT_RAD))
-
-
 def rivals_of(estimate: Estimate, truth: Float64Array) -> tuple[Rival, ...]:
     """Return the wrong poses of an estimate that have some probability."""
     aligned = estimate.aligned
@@ -160,7 +152,9 @@ def drive_from(
         off_m = float(np.hypot(*(estimate.grid[:2] - truth[:2])))
         if first is None:
             first = estimate, truth
-            is_certain = float(estimate.aligned.probabilities[is_right(estimate, truth)].sum()) >= MOST_OFF_MAP
+            is_certain = (
+                float(estimate.aligned.probabilities[right_aligned(estimate.aligned, truth)].sum()) >= MOST_OFF_MAP
+            )
         if estimate.status is FixStatus.FIX:
             had_wrong_fix |= off_m > RIGHT_WITHIN_M
             if off_m <= RIGHT_WITHIN_M:
@@ -168,7 +162,7 @@ def drive_from(
                 break
     assert first is not None  # the first step needs no room
     estimate, truth = first
-    right = is_right(estimate, truth)
+    right = right_aligned(estimate.aligned, truth)
     return DrivenPlace(
         easting=float(truth[0]),
         northing=float(truth[1]),
@@ -229,8 +223,7 @@ def _wheel_odometry(
         nonlocal done
         # One sample beyond the stamp, so that its pose can be interpolated.
         while done < len(times) and (done == 0 or stamps[done - 1] < stamp_ns):
-            c, s = math.cos(heading[done]), math.sin(heading[done])
-            yield int(stamps[done]), np.array([[c, -s, 0, x[done]], [s, c, 0, y[done]], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+            yield int(stamps[done]), planar_pose(x[done], y[done], heading[done])
             done += 1
 
     return until

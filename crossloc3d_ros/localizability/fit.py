@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import expit
 
 from crossloc3d_ros.types import AlignedPoses, Float64Array
@@ -68,11 +69,7 @@ def fit_offset(scans: Sequence[ScanOdds]) -> FittedOffset:
         return float(weight @ (right - expit(log_odds + offset)) - offset / PRIOR_STD**2)
 
     # Falls everywhere: its only zero is the maximum.
-    low, high = -_LARGEST, _LARGEST
-    while high - low > 1e-6:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if slope(middle) > 0.0 else (low, middle)
-    unlimited = 0.5 * (low + high)
+    unlimited = float(brentq(slope, -_LARGEST, _LARGEST, xtol=1e-6))
     belief = expit(log_odds + unlimited)
     std = 1.0 / math.sqrt(float(weight @ (belief * (1.0 - belief))) + PRIOR_STD**-2)
     strangers = [scan.log_odds for scan in scans if not scan.on_map]

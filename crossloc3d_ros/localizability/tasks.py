@@ -13,11 +13,11 @@ from crossloc3d_ros.aerial_map.calibration import MapCalibration
 from crossloc3d_ros.aerial_map.store import AerialMap
 from crossloc3d_ros.config import LocalizabilityConfig
 from crossloc3d_ros.errors import AerialDataError
+from crossloc3d_ros.evaluation.poses.errors import right_aligned
 from crossloc3d_ros.localizability.driving import (
     DrivenPlace,
     Sensor,
     drive_from,
-    is_right,
     plan_way,
     starts_of,
     steps_from,
@@ -77,7 +77,9 @@ def scan_square(task: SquareTask, encoder: DescriptorEncoder, advance: Advance |
     scans = []
     for start_m in starts_of(way, task.square.places).tolist():
         _, estimate, truth = next(steps_from(way, world, sensor, localizer, start_m, task.config.seed))
-        scans.append(ScanOdds(odds_of(estimate.aligned), bool(is_right(estimate, truth).any()), on_map=True))
+        scans.append(
+            ScanOdds(odds_of(estimate.aligned), bool(right_aligned(estimate.aligned, truth).any()), on_map=True)
+        )
         if advance is not None:
             advance(1)
     return scans

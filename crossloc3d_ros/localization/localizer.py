@@ -12,7 +12,7 @@ from crossloc3d_ros.clouds.filters import mounting_matrix
 from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
 from crossloc3d_ros.config import AlignmentConfig, LocalizerConfig
 from crossloc3d_ros.localization.alignment.aligner import Aligner, moved
-from crossloc3d_ros.localization.alignment.evidence import evidence_of
+from crossloc3d_ros.localization.alignment.evidence import evidence_of_scan
 from crossloc3d_ros.localization.alignment.local_map import LocalMap
 from crossloc3d_ros.localization.estimates import Watch, no_estimate, placed_estimate, posed_estimate
 from crossloc3d_ros.localization.fusion.odometry import Motion, plausible_motion
@@ -181,8 +181,7 @@ class Localizer:
     ) -> AlignedPoses:
         """Align at the hypotheses; around the candidates and on the whole map when a search is due."""
         config, schedule = self.config.alignment, self._schedule
-        sensor_xy = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
-        newest = evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy)
+        newest = evidence = evidence_of_scan(prepared, T_base_lidar)
         if not self._tracker.skips:
             motion = self._tracker.motion
             self._local_map.move(motion.delta if motion.is_known else None)

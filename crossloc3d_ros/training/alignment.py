@@ -24,9 +24,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from crossloc3d_ros.aerial_map.store import AerialMap
-from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.evaluation.poses.errors import right_aligned
 from crossloc3d_ros.localization.alignment.aligner import Aligner
 from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS, Evidence
 from crossloc3d_ros.localization.alignment.likelihood import MapLikelihood
@@ -42,8 +42,6 @@ from crossloc3d_ros.localization.alignment.observation_model import (
 from crossloc3d_ros.training.queries import Query
 from crossloc3d_ros.types import AlignedPoses, BoolArray, Float64Array, Int64Array, no_candidates
 
-RIGHT_M, RIGHT_RAD = 2.0, math.radians(5.0)
-"""A pose is right within these."""
 NEAR_M = 10.0
 """A pose that is not right but as near as this teaches neither."""
 
@@ -148,9 +146,7 @@ def fit_weights(measured: Sequence[MeasuredPoses]) -> Float64Array:
 
 def is_right(aligned: AlignedPoses, query: Query) -> BoolArray:
     """Return which aligned poses (p,) are those of the query."""
-    return np.asarray(
-        (_away(aligned, query) <= RIGHT_M) & (np.abs(wrap(aligned.heading_rad - query.heading_rad)) <= RIGHT_RAD)
-    )
+    return right_aligned(aligned, np.append(query.T_grid_base[:2, 3], query.heading_rad))
 
 
 def _away(aligned: AlignedPoses, query: Query) -> Float64Array:

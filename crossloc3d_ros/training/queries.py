@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crossloc3d_ros.clouds.scan import PreparedScan, prepare_scan
+from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import FusionConfig, PreprocessingConfig, ScanConfig
 from crossloc3d_ros.datasets.pose_drives import RawDrive
 from crossloc3d_ros.datasets.raw_scans import RawScan
-from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of
+from crossloc3d_ros.localization.alignment.evidence import Evidence, evidence_of_scan
 from crossloc3d_ros.localization.alignment.local_map import LocalMap
-from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer, unknown_motion
+from crossloc3d_ros.localization.fusion.odometry import OdometryBuffer, planar_pose, unknown_motion
 from crossloc3d_ros.types import Float32Array, Float64Array, UInt8Array
 
 EVERY_M = 10.0
@@ -52,8 +52,7 @@ def local_maps(drive: RawDrive, scans: Iterable[RawScan], length_m: float) -> li
     """Return the local maps of `length_m` every `EVERY_M` along a drive, whose `scans` may be of fewer points."""
     odometry = OdometryBuffer(FusionConfig())
     for stamp_ns, (x, y, heading) in zip(drive.odometry_ns.tolist(), drive.odometry.tolist(), strict=True):
-        c, s = np.cos(heading), np.sin(heading)
-        odometry.add(stamp_ns, np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64))
+        odometry.add(stamp_ns, planar_pose(x, y, heading))
     local_map, since_m = LocalMap(length_m), 0.0
     motion, last_ns = unknown_motion("no scan yet"), 0
     queries = []
@@ -70,14 +69,12 @@ def local_maps(drive: RawDrive, scans: Iterable[RawScan], length_m: float) -> li
     return queries
 
 
-def prepared_of(scan: RawScan) -> PreparedScan:
-    """Return a raw scan as the localizer prepares it."""
-    return prepare_scan(scan.as_scan(), ScanConfig(), PreprocessingConfig(), scan.up_base, scan.T_base_lidar)
-
-
 def _evidence(scan: RawScan) -> Evidence:
-    prepared, T = prepared_of(scan), scan.T_base_lidar
-    return evidence_of(prepared.place, prepared.sensor_height_m, (float(T[0, 3]), float(T[1, 3])))
+    """Return the evidence of a raw scan, prepared as the localizer does it."""
+    mounting = scan.T_base_lidar
+    return evidence_of_scan(
+        prepare_scan(scan.as_scan(), ScanConfig(), PreprocessingConfig(), scan.up_base, mounting), mounting
+    )
 
 
 def _query(evidence: Evidence, scan: RawScan) -> Query:

@@ -16,6 +16,7 @@ from crossloc3d_ros.config import AlignmentConfig
 from crossloc3d_ros.datasets.pose_sets import PoseSet
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.errors import TrainingError
+from crossloc3d_ros.evaluation.poses.errors import WITHIN_DEG, WITHIN_M
 from crossloc3d_ros.localization.alignment.aligner import Aligner
 from crossloc3d_ros.localization.alignment.evidence import CHANNELS, LAYERS
 from crossloc3d_ros.localization.alignment.observation_model import (
@@ -29,8 +30,6 @@ from crossloc3d_ros.localization.alignment.observation_model import (
 from crossloc3d_ros.training import alignment as training
 from crossloc3d_ros.training.alignment import (
     NEAR_M,
-    RIGHT_M,
-    RIGHT_RAD,
     LearningSet,
     MeasuredPoses,
     fit_alignment,
@@ -40,6 +39,7 @@ from crossloc3d_ros.training.alignment import (
 from crossloc3d_ros.training.queries import Query, query_of
 from crossloc3d_ros.types import AlignedPoses, Float64Array, no_aligned_poses, no_candidates
 
+RIGHT_M, RIGHT_RAD = WITHIN_M, math.radians(WITHIN_DEG)
 Learned = tuple[ObservationModel, list[MeasuredPoses]]
 WEIGHTS = np.array([3.0, 1.0, 2.0, 0.8, 1.2, -1.5])
 LOG_PRIOR = -2.0

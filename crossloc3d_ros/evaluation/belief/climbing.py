@@ -9,7 +9,7 @@ from crossloc3d_ros.clouds.scan import prepare_scan
 from crossloc3d_ros.config import LocalizerConfig
 from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.localization.alignment.aligner import Aligner
-from crossloc3d_ros.localization.alignment.evidence import evidence_of
+from crossloc3d_ros.localization.alignment.evidence import evidence_of_scan
 from crossloc3d_ros.types import DescriptorEncoder, Estimate, Float64Array, Hypotheses
 
 COLUMN = "climbed"
@@ -34,9 +34,7 @@ class Climber:
         prepared = prepare_scan(scan.as_scan(), self._config.scan, self._preprocessing, scan.up_base, mounting)
         if prepared.patch is None:
             return nothing
-        sensor_xy_m = float(mounting[0, 3]), float(mounting[1, 3])
-        evidence = evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
-        alignment = self._aligner.begin(evidence, estimate.candidates)
+        alignment = self._aligner.begin(evidence_of_scan(prepared, mounting), estimate.candidates)
         if alignment is None:
             return nothing
         answer = estimate.aligned

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
+from crossloc3d_ros.angles import wrap
 from crossloc3d_ros.evaluation.poses.predictions import PosePredictions
 from crossloc3d_ros.evaluation.statistics import squared_mahalanobis
-from crossloc3d_ros.types import WHOLE_MAP, BoolArray, Float64Array, Int64Array
+from crossloc3d_ros.types import WHOLE_MAP, AlignedPoses, BoolArray, Float64Array, Int64Array
 
 WITHIN_M, WITHIN_DEG = 2.0, 5.0
 """A pose that is at most so far from the truth is right."""
@@ -45,6 +47,13 @@ def is_right(predictions: PosePredictions, pose: Float64Array) -> BoolArray:
     """Say (N,) of poses (N, 3) easting, northing, heading whether they are within 2 m and 5 degrees."""
     near = distance_m(predictions, pose) <= WITHIN_M
     return np.asarray(near & (heading_error_deg(predictions, pose) <= WITHIN_DEG), np.bool_)
+
+
+def right_aligned(aligned: AlignedPoses, truth: Float64Array) -> BoolArray:
+    """Return which aligned poses (p,) of a scan are within 2 m and 5 degrees of the true easting, northing, heading."""
+    away = np.hypot(*(aligned.grid[:, :2] - truth[:2]).T)
+    turned = np.abs(wrap(aligned.heading_rad - truth[2]))
+    return np.asarray((away <= WITHIN_M) & (turned <= math.radians(WITHIN_DEG)))
 
 
 def retrieved(predictions: PosePredictions) -> Float64Array:

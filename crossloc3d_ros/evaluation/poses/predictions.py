@@ -20,6 +20,7 @@ from crossloc3d_ros.datasets.raw_scans import RawScan
 from crossloc3d_ros.datasets.set_maps import Progress
 from crossloc3d_ros.errors import EvaluationError
 from crossloc3d_ros.geodesy import MapFrame
+from crossloc3d_ros.localization.fusion.odometry import planar_pose
 from crossloc3d_ros.localization.localizer import Localizer
 from crossloc3d_ros.localization.session import OdometryKind, ScanLocalizer, Session
 from crossloc3d_ros.types import (
@@ -251,7 +252,7 @@ def predict_journey(
     for step in steps_of(journey, drives):
         scan = dataclasses.replace(drives[step.drive].scans[step.row], stamp_ns=step.stamp_ns)
         for stamp_ns, (x, y, heading) in zip(step.odometry_ns.tolist(), step.odometry.tolist(), strict=True):
-            session.add_odometry(stamp_ns, _planar_pose(x, y, heading))
+            session.add_odometry(stamp_ns, planar_pose(x, y, heading))
         estimate = _localize(session, scan)
         rows.append(_row(scan, estimate, frame, number, step.leg, step.travelled_m))
         advance(1)
@@ -272,11 +273,6 @@ def number_of_alone(predictions: PosePredictions) -> Int64Array:
 
 def _localize(session: Session, scan: RawScan) -> Estimate:
     return session.localize(session.receive(scan.as_scan(), scan.T_base_lidar, scan.up_base)).estimate
-
-
-def _planar_pose(x: float, y: float, heading: float) -> Float64Array:
-    cosine, sine = math.cos(heading), math.sin(heading)
-    return np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
 
 
 def _row(

@@ -201,7 +201,11 @@ class Alignment:
         self._fine = fine_evidence(evidence)
         self._climb_evidence = self._fine.sample(_CLIMB_HITS, _CLIMB_FREE)
         self._newest = None if newest is None or newest is evidence else fine_evidence(newest)
-        self._newest_known: dict[bytes, tuple[float, Float64Array]] = {}
+        # What tells where exactly: all of it, and as much as poses climb by.
+        self._exact, self._exact_sample = self._fine, self._climb_evidence
+        if self._newest is not None:
+            self._exact, self._exact_sample = self._newest, self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
+        self._weighed: tuple[_Poses, Float64Array, Float64Array, Float64Array] | None = None
         self._maxima, self._is_refined = no_peaks(), np.empty(0, np.bool_)
         self._most_refined = 0
         self._found, self._tracked = _no_poses(), _no_poses()
@@ -227,6 +231,7 @@ class Alignment:
             self._aligner.prepare(hypotheses.grid)
             poses = np.column_stack([self._aligner.local(hypotheses.grid[:, :2]), hypotheses.heading_rad])
             self._tracked = self._refined(poses, -1 - np.arange(len(poses)))
+            self._weighed = None
 
     def is_sufficient(self) -> bool:
         """Return whether one pose is probable enough that the rest of the map need not be searched."""
@@ -277,6 +282,7 @@ class Alignment:
         fresh = merged[~self._is_refined[merged]]
         self._is_refined[fresh] = True
         self._found = self._found.join(self._refined(self._maxima.poses[fresh], None))
+        self._weighed = None
 
     def _refined(self, poses: Float64Array, source: Int64Array | None) -> _Poses:
         """Return where the climb from poses (p, 3) ends; without a source, the candidates near there are it."""
@@ -295,6 +301,11 @@ class Alignment:
 
     def _weighted(self) -> tuple[_Poses, Float64Array, Float64Array, Float64Array]:
         """Return the poses that are kept, best first, their `MEASURES` (p, M), log likelihoods and probabilities."""
+        if self._weighed is None:
+            self._weighed = self._weigh()
+        return self._weighed
+
+    def _weigh(self) -> tuple[_Poses, Float64Array, Float64Array, Float64Array]:
         order = np.argsort(-self._found.scores, kind="stable")
         found = self._found.take(merge(self._found.poses, order, _SAME_M, _SAME_RAD))
         poses = found.join(self._tracked)
@@ -332,19 +343,9 @@ class Alignment:
         some = np.flatnonzero(log_likelihood > 0.0)
         if self._newest is None or not len(self._newest) or not len(some):
             return alone
-        missing = [i for i in some.tolist() if poses.poses[i].tobytes() not in self._newest_known]
-        if missing:
-            at = poses.poses[missing]
-            sample = self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
-            scores = scores_at(self._newest, self._likelihood, at, self._pool)
-            found = measures(self._newest, sample, scores, self._likelihood, at, self._pool)
-            for i, score, row in zip(missing, scores.tolist(), found, strict=True):
-                self._newest_known[poses.poses[i].tobytes()] = (score, row)
-        known = [self._newest_known[poses.poses[i].tobytes()] for i in some.tolist()]
-        measured = with_behind_best(
-            np.array([row for _, row in known]), np.array([s for s, _ in known]), len(self._newest)
-        )
-        alone[some] = self._aligner.model.log_likelihood(measured)
+        scores = scores_at(self._newest, self._likelihood, poses.poses[some], self._pool)
+        own = measures(self._newest, self._exact_sample, scores, self._likelihood, poses.poses[some], self._pool)
+        alone[some] = self._aligner.model.log_likelihood(with_behind_best(own, scores, len(self._newest)))
         return alone
 
     def _where_exactly(self, poses: Float64Array, log_likelihood: Float64Array) -> Float64Array:
@@ -352,17 +353,15 @@ class Alignment:
         if self._newest is None:
             return poses
         exact, counts = poses.copy(), log_likelihood > 0.0
-        evidence = self._newest.sample(_CLIMB_HITS, _CLIMB_FREE)
-        exact[counts] = climb(evidence, self._likelihood, poses[counts], reach_m=_SAME_M, pool=self._pool)[0].poses
+        climbed, _ = climb(self._exact_sample, self._likelihood, poses[counts], reach_m=_SAME_M, pool=self._pool)
+        exact[counts] = climbed.poses
         return exact
 
     def _covariances(self, poses: Float64Array) -> Float64Array:
         """Return the covariances (p, 3, 3) of poses from the shape of the score around them."""
         around_them = (poses[:, None] + _SHAPE).reshape(-1, 3)
-        whole = self._fine if self._newest is None else self._newest
-        some = whole.sample(_CLIMB_HITS, _CLIMB_FREE)
-        scores = scores_at(some, self._likelihood, around_them, self._pool).reshape(len(poses), -1)
-        scores *= len(whole) / max(len(some), 1)  # a sample of the cells stands for all
+        scores = scores_at(self._exact_sample, self._likelihood, around_them, self._pool).reshape(len(poses), -1)
+        scores *= len(self._exact) / max(len(self._exact_sample), 1)  # a sample of the cells stands for all
         weights = np.exp((scores - scores.max(axis=1, keepdims=True)) / self._config.covariance_temperature)
         weights /= weights.sum(axis=1, keepdims=True)
         offsets = _SHAPE - (weights @ _SHAPE)[:, None]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from crossloc3d_ros.clouds.scan import PreparedScan
 from crossloc3d_ros.types import Float32Array, Float64Array, Int64Array
 
 LAYERS_M = np.array([0.5, 1.5, 3.0, 6.0, 50.0], np.float32)
@@ -77,6 +78,12 @@ def evidence_of(place: Float32Array, sensor_height_m: float, sensor_xy_m: tuple[
     xy = (cells + 0.5 - half) * CELL_M + np.asarray(sensor_xy_m)
     near = np.hypot(xy[:, 0], xy[:, 1]) <= REACH_M + CELL_M
     return Evidence(xy[near], channel[near].astype(np.int64))
+
+
+def evidence_of_scan(prepared: PreparedScan, T_base_lidar: Float64Array) -> Evidence:
+    """Return the evidence of a prepared scan of a lidar that is mounted at `T_base_lidar` (4, 4)."""
+    sensor_xy_m = float(T_base_lidar[0, 3]), float(T_base_lidar[1, 3])
+    return evidence_of(prepared.place, prepared.sensor_height_m, sensor_xy_m)
 
 
 @njit(cache=True, nogil=True)

@@ -298,6 +298,12 @@ def motion_covariance(length_m: float, turned_rad: float, config: FusionConfig) 
     return np.diag([position, position, heading])
 
 
+def planar_pose(x_m: float, y_m: float, heading_rad: float) -> Float64Array:
+    """Return the pose (4, 4) of a base on level ground, as `OdometryBuffer.add` takes it."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
+
+
 def _planar(T_odom_base: Float64Array) -> tuple[float, float, float] | None:
     """Return x, y and heading of a pose; None where the matrix (4, 4) is no pose, or stands on its nose."""
     if T_odom_base.shape != (4, 4) or not (np.abs(T_odom_base) < _FARTHEST_M).all():
