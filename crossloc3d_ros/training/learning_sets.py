@@ -34,11 +34,14 @@ def learning_sets(sets: BeliefSets, seed: int = 0) -> list[LearningSet]:
     if kept:
         raise TrainingError(f"'{kept[0]}' is kept for evaluation: learn from the pose set 'fitting' and other surveys")
     rng = np.random.default_rng(seed)
-    regions, queries = _regions(sets), _queries(sets)
+    named = {each.pose_set.map_folder: each.name for each in sets.on_map}
+    named |= {each.folder: each.name for each in sets.maps if each.folder not in named}
+    maps = {folder: AerialMap.load(folder) for folder in named}
+    regions, queries = _regions(named, maps), _queries(sets)
     learned = []
     for each in sets.on_map:
         map_folder = each.pose_set.map_folder
-        strangers = _strangers(sets, queries, map_folder)
+        strangers = _strangers(sets, queries, maps, map_folder)
         for fold, of_fold in _folds(each, queries[_key(each)], regions[map_folder]):
             name = f"{each.name}, {each.condition.name}"
             learned.append(
@@ -47,7 +50,7 @@ def learning_sets(sets: BeliefSets, seed: int = 0) -> list[LearningSet]:
     known = {each.pose_set.map_folder for each in sets.on_map}
     for other in sets.maps:
         if other.folder not in known:
-            strangers = _strangers(sets, queries, other.folder)
+            strangers = _strangers(sets, queries, maps, other.folder)
             learned.append(
                 LearningSet(other.name, regions[other.folder], other.folder, (), _some(strangers, _STRANGERS, rng))
             )
@@ -71,11 +74,8 @@ def _queries(sets: BeliefSets) -> Mapping[tuple[Path, int, float], _Kinds]:
     return found
 
 
-def _regions(sets: BeliefSets) -> dict[Path, str]:
+def _regions(named: Mapping[Path, str], maps: Mapping[Path, AerialMap]) -> dict[Path, str]:
     """Return a name for each map folder: the same for maps that show the same places, or places beside each other."""
-    named = {each.pose_set.map_folder: each.name for each in sets.on_map}
-    named |= {each.folder: each.name for each in sets.maps if each.folder not in named}
-    maps = {folder: AerialMap.load(folder) for folder in named}
     regions: dict[Path, str] = {}
     for folder, name in named.items():
         near = {regions[other] for other in regions if _touch(maps[folder], maps[other])}
@@ -101,17 +101,21 @@ def _folds(each: BeliefSet, queries: _Kinds, region: str) -> Iterator[tuple[str,
         yield name, tuple([q for q in kind if on_map[q.area] and q.area % folds == fold] for kind in queries)
 
 
-def _strangers(sets: BeliefSets, queries: Mapping[tuple[Path, int, float], _Kinds], map_folder: Path) -> _Kinds:
+def _strangers(
+    sets: BeliefSets,
+    queries: Mapping[tuple[Path, int, float], _Kinds],
+    maps: Mapping[Path, AerialMap],
+    map_folder: Path,
+) -> _Kinds:
     """Return the queries, under all conditions, of areas that lie off a map."""
-    aerial_map = AerialMap.load(map_folder)
     strangers: _Kinds = ([], [])
     for each in {_key(each): each for each in sets.on_map}.values():
-        frame_map = AerialMap.load(each.pose_set.map_folder)
+        frame_map = maps[each.pose_set.map_folder]
         kinds = queries[_key(each)]
         for area in range(len(each.pose_set.on_map)):
             chosen = [[query for query in kind if query.area == area] for kind in kinds]
             poses = np.array([query.T_grid_base for kind in chosen for query in kind])
-            if len(poses) and are_apart(aerial_map, frame_map, poses):
+            if len(poses) and are_apart(maps[map_folder], frame_map, poses):
                 for kind, some in zip(strangers, chosen, strict=True):
                     kind += some
     return strangers
